@@ -138,8 +138,8 @@ def detect_anomalies(
     >>> [(a.target, a.direction, a.kind, a.stands_out) for a in detect_anomalies(test, estimate_drift(test))]
     [(3, 'both', 'scatter', True)]
     """
-    check_dataset(deviations, "deviations")
-    check_dataset(estimated, "estimated")
+    deviations = check_dataset(deviations, "deviations")
+    estimated = check_dataset(estimated, "estimated")
     if not 0 < level < 1:
         raise InterferometryError(f"level={level} is not a probability between 0 and 1; 0.05 is usual")
     needed = int(np.ceil(1.0 / (level * min(WEIGHTS.values()))))

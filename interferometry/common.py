@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, ParamSpec, TypeAlias, TypeVar, cast
+import math
+from collections.abc import Callable, Collection
+from dataclasses import fields
+from numbers import Real
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeAlias, TypeVar, cast
 
 from threadpoolctl import threadpool_limits
 
 from thermofuse.resources import variables
+from thermofuse.units import UNITS, conform, find_unit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,29 +44,37 @@ DEVIATIONS, DEVIATION_ATTRIBUTES = variables("deviations")
 ENVIRONMENT, ENVIRONMENT_ATTRIBUTES = variables("environment")
 ESTIMATE = variables("estimate")[0]
 
-#: Name of a contracted argument -> its contract, and what returns such a Dataset.
-_ARGUMENTS = {
-    "deviations": (DEVIATIONS, "read_deviations or build_deviations"),
-    "environment": (ENVIRONMENT, "read_environment"),
-    "estimated": (ESTIMATE, "estimate_drift"),
-}
 
-
-def check_dataset(dataset: xr.Dataset, argument: str) -> None:
-    """Refuse what lacks a variable of the contract of an argument, or holds it over other dims."""
-    contract, source = _ARGUMENTS[argument]
-    remedy = f"give what {source} returns"
-    import xarray as xr
-
-    if not isinstance(dataset, xr.Dataset):
-        raise InterferometryError(f"{argument} is of type {type(dataset).__name__}, not a Dataset; {remedy}")
-    for name, (dims, *_) in contract.items():
-        if name == "quality_flag":
+def check_uncertainties(
+    parameters: Any, *, signed: Collection[str] = (), error: type[InterferometryError] = InterferometryError
+) -> None:
+    """Refuse fields of a dataclass that are neither None nor finite numbers, or negative without being `signed`."""
+    for field in fields(parameters):
+        value = getattr(parameters, field.name)
+        if value is None:
             continue
-        expected = f"{name!r} ({', '.join(dims)})"
-        if name not in dataset.variables:
-            raise InterferometryError(f"{argument} has no variable {expected}; {remedy}")
-        if dataset[name].dims != dims:
-            raise InterferometryError(
-                f"{argument} has {name!r} over ({', '.join(map(str, dataset[name].dims))}) instead of {expected}; {remedy}"
-            )
+        if not isinstance(value, Real) or not math.isfinite(value) or (value < 0 and field.name not in signed):
+            raise error(f"{field.name}={value!r}: give a finite number{'' if field.name in signed else ', 0 or more'}")
+
+
+#: Name of a contracted argument -> contract, attributes with the units, and what returns such a Dataset.
+_ARGUMENTS = {
+    "deviations": (DEVIATIONS, DEVIATION_ATTRIBUTES, "read_deviations or build_deviations"),
+    "environment": (ENVIRONMENT, ENVIRONMENT_ATTRIBUTES, "read_environment"),
+    "estimated": (*variables("estimate"), "estimate_drift"),
+}
+#: Units of the readings of a rotary axis.
+_ROTARY = {"deviation": "arcsec", "position": "deg"}
+
+
+def check_dataset(dataset: xr.Dataset, argument: str, *, rotary: bool = False) -> xr.Dataset:
+    """Return an argument in the units of its contract, of a rotary axis (where it is accepted) in those of angles; refuse what lacks a
+    variable, or holds it over other dims or in a unit that cannot be converted.
+    """
+    contract, described, source = _ARGUMENTS[argument]
+    if rotary and "deviation" in getattr(dataset, "variables", ()):
+        unit = UNITS.get(find_unit(str(dataset["deviation"].attrs.get("units"))) or "")
+        if unit is not None and unit.kind == "angle":
+            described = {name: {"units": unit} for name, unit in _ROTARY.items()}
+    needs = {name: dims for name, (dims, *_) in contract.items() if name != "quality_flag"}
+    return conform(dataset, needs, described, name=argument, source=source, error=InterferometryError)

@@ -8,13 +8,13 @@ compensated again, with the logged air and with any temperature of the axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import ref_index
 
-from interferometry.common import Array, InterferometryError, check_dataset
+from interferometry.common import Array, InterferometryError, check_dataset, check_uncertainties
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,7 +38,8 @@ class CompensationError(InterferometryError):
 class SensorUncertainty:
     """Standard uncertainties (k = 1) of the inputs of the compensation; ``formula_ppm`` is that of Ciddor's equation.
 
-    The defaults are those of an XL-80 with weather station, half its k = 2 specification. A negative one raises `CompensationError`.
+    The defaults are those of an XL-80 with weather station, half its k = 2 specification. One that is negative or not finite raises
+    `CompensationError`.
     """
 
     air_temperature_K: float = 0.1
@@ -50,9 +51,7 @@ class SensorUncertainty:
     dead_path_mm: float = 2.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if getattr(self, field.name) < 0:
-                raise CompensationError(f"{field.name}={getattr(self, field.name)} is negative; give 0 or more")
+        check_uncertainties(self, error=CompensationError)
 
 
 def air_index(
@@ -206,8 +205,8 @@ def compensate(
     >>> redone["correction_scale"].values.round(2).tolist()
     [[[-1.37], [-1.37]]]
     """
-    check_dataset(deviations, "deviations")
-    check_dataset(environment, "environment")
+    deviations = check_dataset(deviations, "deviations")
+    environment = check_dataset(environment, "environment")
     _check_numbers(
         expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
         dead_path_mm=dead_path_mm,

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from interferometry.common import DEVIATION_ATTRIBUTES, DIRECTIONS, Array, InterferometryError
 
@@ -41,7 +42,7 @@ ROUNDING = 1.0 / np.sqrt(12.0)
 
 
 def build_deviations(
-    cycles: Sequence[int], targets: Sequence[int], position_mm: np.ndarray, deviation_um: np.ndarray, time: np.ndarray
+    cycles: Sequence[int], targets: Sequence[int], position_mm: ArrayLike, deviation_um: ArrayLike, time: ArrayLike
 ) -> xr.Dataset:
     """Build the Dataset of positioning deviations from plain arrays.
 
@@ -53,10 +54,10 @@ def build_deviations(
         Numbers of the target positions, from 1.
     position_mm : (n_targets,) array_like
         Target positions, mm.
-    deviation_um : (n_cycles, 2, n_targets) ndarray
+    deviation_um : (n_cycles, 2, n_targets) array_like
         Positioning deviations x_ij, actual minus target position (ISO 230-2), um; first the positive, then the negative
         direction of approach; NaN where there is no reading.
-    time : (n_cycles, 2, n_targets) ndarray of datetime64
+    time : (n_cycles, 2, n_targets) array_like of datetime64
         UTC; NaT where there is no reading or no time.
 
     Returns
@@ -68,7 +69,8 @@ def build_deviations(
     Raises
     ------
     InterferometryError
-        An array does not have the shape that the numbers of cycles and targets give.
+        An array does not have the shape that the numbers of cycles and targets give, a number of cycle or target or a position comes twice,
+        or a value is no number or infinite.
 
     Notes
     -----
@@ -86,12 +88,21 @@ def build_deviations(
     [[[0, 0], [0, 1]]]
     """
     cells = (len(cycles), len(DIRECTIONS), len(targets))
+    position_mm, deviation_um = _numbers("position_mm", position_mm), _numbers("deviation_um", deviation_um)
+    time = np.asarray(time, "datetime64[ns]")
     arrays = {"position_mm": (position_mm, cells[2:]), "deviation_um": (deviation_um, cells), "time": (time, cells)}
     for name, (values, shape) in arrays.items():
         if np.shape(values) != shape:
             raise InterferometryError(
                 f"{name} has shape {np.shape(values)}; {len(cycles)} cycles, 2 directions and {len(targets)} targets need {shape}"
             )
+    for name, numbers in (("cycles", cycles), ("targets", targets), ("position_mm", position_mm)):
+        if np.unique(numbers).size < len(numbers):
+            raise InterferometryError(f"{name} holds a value twice: {np.asarray(numbers).tolist()}; give each once")
+    if np.isinf(deviation_um).any() or not np.isfinite(position_mm).all():
+        raise InterferometryError(
+            "position_mm and deviation_um must be finite; of a reading that is missing the deviation is NaN"
+        )
     missing = np.where(np.isnan(deviation_um), np.uint8(MISSING.mask), np.uint8(0))
     flags = {
         "flag_masks": np.array([flag.mask for flag in REGISTRY], dtype="u1"),
@@ -100,14 +111,23 @@ def build_deviations(
     described = DEVIATION_ATTRIBUTES
     return xr.Dataset(
         {
-            "deviation": (DIMS, deviation_um.astype("f8"), described["deviation"]),
-            "time": (DIMS, time.astype("datetime64[ns]"), described["time"]),
-            "position": (("target",), np.asarray(position_mm, dtype="f8"), described["position"]),
+            "deviation": (DIMS, deviation_um, described["deviation"]),
+            "time": (DIMS, time, described["time"]),
+            "position": (("target",), position_mm, described["position"]),
             "quality_flag": (DIMS, missing, described["quality_flag"] | flags),
             "resolution": ((), resolution(deviation_um), described["resolution"]),
         },
         coords={"cycle": list(cycles), "direction": list(DIRECTIONS), "target": list(targets)},
     )
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    try:
+        return np.array(values, dtype="f8")
+    except (TypeError, ValueError):
+        raise InterferometryError(
+            f"{name} holds what is no number; give an array of floats, NaN where there is no reading"
+        ) from None
 
 
 def resolution(values: Array) -> float:

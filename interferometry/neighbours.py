@@ -90,7 +90,7 @@ def evaluate_neighbours(deviations: xr.Dataset) -> xr.Dataset:
     >>> links["mean_difference"].values.tolist(), links["standard_deviation"].values.tolist()
     ([[-1.0], [-2.0]], [[0.0], [0.0]])
     """
-    check_dataset(deviations, "deviations")
+    deviations = check_dataset(deviations, "deviations")
     x = _along_axis(deviations)
     if x.sizes["target"] < 2:
         raise InterferometryError(f"{x.sizes['target']} target has no neighbour; measure at least two target positions")
@@ -177,6 +177,7 @@ def compare(deviations: xr.Dataset, estimated: xr.Dataset | None = None) -> xr.D
     >>> compare(test)["ratio"].values.round(1).tolist()
     [[0.7], [0.7]]
     """
+    deviations = check_dataset(deviations, "deviations")
     links = evaluate_neighbours(deviations)
     numbers = links["link"].values
 

@@ -101,7 +101,7 @@ def plot_deviations(
     >>> from interferometry import read_deviations
     >>> ax = plot_deviations(read_deviations("laser.csv"))  # doctest: +SKIP
     """
-    check_dataset(deviations, "deviations")
+    deviations = check_dataset(deviations, "deviations")
     ax = new_axes(ax)
     import matplotlib as mpl
 
@@ -149,7 +149,7 @@ def plot_position(
     --------
     >>> ax = plot_position(deviations, estimate_drift(deviations), target=3)  # doctest: +SKIP
     """
-    check_dataset(deviations, "deviations")
+    deviations = check_dataset(deviations, "deviations")
     if target not in deviations["target"].values:
         raise InterferometryError(f"target={target} is not one of {deviations['target'].values.tolist()}")
     ax = new_axes(ax)
@@ -198,8 +198,8 @@ def plot_profile(deviations: xr.Dataset, estimated: xr.Dataset, ax: Axes | None 
     --------
     >>> ax = plot_profile(deviations, estimate_drift(deviations))  # doctest: +SKIP
     """
-    check_dataset(deviations, "deviations")
-    check_dataset(estimated, "estimated")
+    deviations = check_dataset(deviations, "deviations")
+    estimated = check_dataset(estimated, "estimated")
     ax = new_axes(ax)
     ordered = estimated.assign(position=deviations["position"]).sortby("position")
     for direction in map(str, ordered["direction"].values):
@@ -247,8 +247,8 @@ def plot_drift(
     --------
     >>> ax = plot_drift(deviations, estimate_drift(deviations))  # doctest: +SKIP
     """
-    check_dataset(deviations, "deviations")
-    check_dataset(estimated, "estimated")
+    deviations = check_dataset(deviations, "deviations")
+    estimated = check_dataset(estimated, "estimated")
     ax = new_axes(ax)
     import matplotlib as mpl
 
@@ -328,7 +328,7 @@ def plot_scatter(deviations: xr.Dataset, estimated: xr.Dataset | None = None, ax
     differenced = rms(links["position_standard_deviation"])
     ax.plot(between, differenced, "s-", color=COLOURS["negative"], label="neighbour differences, divided by √2")
     if estimated is not None:
-        check_dataset(estimated, "estimated")
+        estimated = check_dataset(estimated, "estimated")
         free = estimated["scatter_position"].sortby(position)
         ax.plot(along, free, "d-", color=COLOURS["positive"], label="joint estimate, free of drift")
     ax.set(xlabel="position / mm", ylabel="standard deviation / µm", ylim=(0, None))

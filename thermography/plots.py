@@ -60,6 +60,10 @@ def plot_field(
     >>> from thermography import reduce_frames
     >>> ax = plot_field(reduce_frames(frames, registration, grid, bounds))  # doctest: +SKIP
     """
+    if not isinstance(fields, xr.Dataset) or not {*fields} & _QUANTITIES.keys():
+        raise ThermographyError(
+            "fields holds no temperature on a plan; give what reduce_frames returns, or fields.nc of a run"
+        )
     if quantity not in _QUANTITIES or quantity not in fields:
         raise ThermographyError(
             f"quantity={quantity!r} is not one of {[name for name in _QUANTITIES if name in fields]}"

@@ -576,9 +576,9 @@ class FolderContent:
         return Path(os.path.relpath(path, self.folder)).as_posix()
 
 
-def scan_folder(folder: Path) -> FolderContent:
-    """Look at every file of a folder and its subfolders."""
-    paths = list(input_files(folder))
+def scan_folder(folder: Path, *, within: Path | None = None) -> FolderContent:
+    """Look at every file of a folder and its subfolders; links that lead out of `within` are not followed."""
+    paths = list(input_files(folder, within=within))
     series = thermal_series(paths)
     thermal = {path for members in series.values() for path in members}
     patterns, frames = [], []
@@ -627,19 +627,24 @@ def _by_series(paths: Iterable[Path]) -> dict[tuple[Path, str], list[Path]]:
     return series
 
 
-def input_files(folder: Path, seen: set[Path] | None = None) -> Iterator[Path]:
-    """Yield the files of a folder and its subfolders, sorted, without hidden ones and without results of a run."""
+def input_files(folder: Path, seen: set[Path] | None = None, *, within: Path | None = None) -> Iterator[Path]:
+    """Yield the files of a folder and its subfolders, sorted, without hidden ones, results of a run, and links out of `within`."""
     seen = set() if seen is None else seen
     if folder.resolve() in seen:
         return
     seen.add(folder.resolve())
     for path in in_order(folder.iterdir()):
-        if path.name.startswith("."):
+        if path.name.startswith(".") or (within is not None and leads_out(path, within)):
             continue
         if not path.is_dir():
             yield path
         elif not any((path / name).is_file() for name in _RESULTS):
-            yield from input_files(path, seen)
+            yield from input_files(path, seen, within=within)
+
+
+def leads_out(path: Path, folder: Path) -> bool:
+    """Return whether a path is a symbolic link to a place outside a folder."""
+    return path.is_symlink() and not path.resolve().is_relative_to(folder.resolve())
 
 
 #: Thermal files of one folder and ending that are described one by one; more are a series.
@@ -689,11 +694,11 @@ class Inspected:
         return {"file": self.label, "kind": self.kind.value.words, "lines": lines, "fault": self.fault}
 
 
-def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
-    """Look into files and folders."""
-    named, files = set(paths), _files(paths)
+def inspect_paths(paths: Sequence[Path], *, within: Path | None = None) -> Iterator[Inspected]:
+    """Look into files and folders; links in these that lead out of `within` are not followed."""
+    named, files = set(paths), _files(paths, within)
     for path in paths:
-        if path.is_dir() and not any(True for _ in input_files(path)):
+        if path.is_dir() and not any(True for _ in input_files(path, within=within)):
             fault = "contains no file to inspect (hidden files and results are skipped); name the folder of the measured files"
             yield Inspected(str(path), Kind.UNKNOWN, fault=fault, named=True)
     series = thermal_series(files) | _by_series(path for path in files if path.suffix == ".exr")
@@ -716,9 +721,10 @@ def write_frames(paths: Sequence[Path], folder: Path, formats: Sequence[str]) ->
     yield from (f"left out: {one.reason}" for one in rejected)
 
 
-def _files(paths: Sequence[Path]) -> list[Path]:
+def _files(paths: Sequence[Path], within: Path | None = None) -> list[Path]:
     """Return files, and those of folders, each once."""
-    return list(dict.fromkeys(file for path in paths for file in (input_files(path) if path.is_dir() else [path])))
+    found = (input_files(path, within=within) if path.is_dir() else [path] for path in paths)
+    return list(dict.fromkeys(file for files in found for file in files))
 
 
 def _inspect(path: Path, *, named: bool) -> Inspected:

@@ -214,7 +214,7 @@ def estimate_drift(
     >>> estimated["reversal"].values.round(1).tolist()
     [-2.0, -2.0, -2.0]
     """
-    check_dataset(deviations, "deviations")
+    deviations = check_dataset(deviations, "deviations")
     # Profiles and covariances are laid out by the index of the approach.
     ordered = deviations.reindex(direction=list(DIRECTIONS)) if _unordered(deviations) else deviations
     joint = fit_joint(ordered, robust=robust, order=order, components=components)
@@ -271,7 +271,7 @@ def fit_joint(
     deviations: xr.Dataset, *, robust: bool = True, order: Order | None = None, components: Sequence[str] | None = None
 ) -> JointFit:
     """Fit profile and drift; `estimate_drift` also describes the result."""
-    check_dataset(deviations, "deviations")
+    deviations = check_dataset(deviations, "deviations")
     if order not in (None, 1, 2):
         raise DriftDataError(f"order={order!r} is neither 1 (random walk), 2 (integrated random walk) nor None")
     readings = sort_readings(deviations)

@@ -113,7 +113,7 @@ def plan_cycles(
     >>> plan.warnings[0].split(":")[0]
     'every target spacing is a whole number of leads (10 mm)'
     """
-    check_dataset(deviations, "deviations")
+    deviations = check_dataset(deviations, "deviations")
     if not wanted_u_um > 0:
         raise InterferometryError(f"wanted_u_um={wanted_u_um} is not above 0")
     measured = int(np.isfinite(deviations["deviation"].values).any(axis=(1, 2)).sum())

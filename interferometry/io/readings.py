@@ -37,7 +37,6 @@ from interferometry.io.renishaw import (
 )
 from interferometry.io.tables import (
     UNIT_WORDS,
-    UNITS,
     DateOrder,
     DelimitedTable,
     Grid,
@@ -45,7 +44,6 @@ from interferometry.io.tables import (
     by_direction_letter,
     describe_time_zone,
     find_direction,
-    find_unit,
     fold,
     is_direction_letter,
     parse_time,
@@ -56,6 +54,7 @@ from interferometry.io.tables import (
     split_unit,
     table_below,
 )
+from thermofuse.units import UNITS, find_unit
 
 #: Positions closer than this are one, mm or deg.
 POSITION_TOLERANCE = 1e-4
@@ -1189,7 +1188,7 @@ def read_deviations(
     if deviations["deviation"].attrs["units"] != "um" and not rotary:
         raise LaserFormatError(
             f"{path}: the positions are angles; a rotary axis is evaluated by ISO 230-2 alone, without a camera and not while it is "
-            "measured: heat and expansion are explained along a linear axis; give the readings alone to thermofuse run or iso230"
+            "measured: heat and expansion are explained along a linear axis; give the readings alone (read_deviations: rotary=True)"
         )
     return deviations
 

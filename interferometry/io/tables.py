@@ -27,7 +27,8 @@ from interferometry.io.faults import (
     raise_if_mostly_invalid,
 )
 from interferometry.io.spreadsheets import is_workbook, read_sheets
-from thermofuse.resources import vocabulary, with_degree_sign
+from thermofuse.resources import vocabulary
+from thermofuse.units import SHARES, find_unit
 
 #: Words of tables: headings, directions, units, months.
 _VOCABULARY = vocabulary("headings")
@@ -167,34 +168,12 @@ def describe_time_zone(path: Path, zones: dict[str, int]) -> str:
 # Headings of columns: what they name, in five languages, and the unit that they carry.
 
 
-@dataclass(frozen=True)
-class Unit:
-    """A unit: its kind of quantity ("length", ...); value * factor + offset is in mm, deg, degC, hPa or percent."""
-
-    kind: str
-    factor: float
-    offset: float
-
-
 #: What a cell says of the row or column of units.
 UNIT_WORDS = frozenset(_VOCABULARY["unit_words"])
-#: Unit as it is written, in lower case -> its meaning.
-UNITS = {
-    word: Unit(unit["kind"], unit["factor"], unit["offset"]) for unit in _VOCABULARY["units"] for word in unit["words"]
-}
-_SHARES = [(word, float(share)) for share, words in _VOCABULARY["shares"].items() for word in words]
-UNITS |= {
-    f"{share}{gap}{word}": Unit(unit.kind, factor * unit.factor, 0.0)
-    for word, unit in UNITS.items()
-    for share, factor in _SHARES
-    for gap in ("", " ")
-    if unit.kind == "length"
-}
-
 _BRACKETS = re.compile(r"\s*[(\[（【{]\s*([^()\[\]（）【】{}]*?)\s*[)\]）】}]\s*")
 _MARK = r"(.*\S)\s*(?:/|,|;|\sin\s|_|\s)\s*"
 _AFTER_MARK = (
-    re.compile(rf"{_MARK}((?:{'|'.join(re.escape(share) for share, _ in _SHARES)})\s*\S+)"),
+    re.compile(rf"{_MARK}((?:{'|'.join(re.escape(share) for share, _ in SHARES)})\s*\S+)"),
     re.compile(rf"{_MARK}(\S+)"),
 )
 #: End of a name that makes a share of the unit behind it, as in "1/8 um".
@@ -219,13 +198,6 @@ def fold(text: str) -> str:
     """Return a text for comparison: lower case, without accents, dots, underscores and surplus spaces."""
     plain = "".join(c for c in unicodedata.normalize("NFKD", text.casefold()) if not unicodedata.combining(c))
     return re.sub(r"[\s_.:;,/\\#’'–-]+", " ", plain.replace("º", "o").replace("№", "no")).strip()
-
-
-def find_unit(text: str) -> str | None:
-    """Return the key of a unit as it is written, None where it is none."""
-    # Two signs are used for micro: the Greek letter and the micro sign.
-    cleaned = with_degree_sign(text).casefold().replace("μ", "µ").replace("’’", "''")
-    return cleaned if cleaned in UNITS else None
 
 
 @lru_cache(1 << 16)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from interferometry.common import InterferometryError
+from interferometry.common import InterferometryError, check_dataset
 
 #: Lines of the ENVIRONMENT block: key of the argument, label in the file, factor to the file's unit.
 _ENVIRONMENT = (
@@ -59,7 +59,7 @@ def write_rtl(
     Raises
     ------
     InterferometryError
-        An unknown name in ``environment`` or ``user_text``.
+        An unknown name in ``environment`` or ``user_text``, or ``deviations`` do not keep their contract.
 
     Notes
     -----
@@ -79,6 +79,7 @@ def write_rtl(
     >>> read_deviations(path)["deviation"].values.tolist()
     [[[0.1, 1.2], [0.5, 1.6]]]
     """
+    deviations = check_dataset(deviations, "deviations")
     environment, user_text = environment or {}, user_text or {}
     _raise_if_unknown("environment", environment, [name for name, _, _ in _ENVIRONMENT])
     _raise_if_unknown("user_text", user_text, [name for name, _ in _USER_TEXT])

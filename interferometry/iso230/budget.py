@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from interferometry.common import InterferometryError
+from interferometry.common import check_uncertainties
 
 #: Contributions to the uncertainty, in the order of the budget. The last two are the sampling, by which a few cycles stand for the axis:
 #: scatter of the readings, and that the largest of noisy values is too large.
@@ -52,7 +52,7 @@ class Iso230Budget:
     Raises
     ------
     InterferometryError
-        A standard uncertainty is negative.
+        A value is not finite, or a standard uncertainty negative.
 
     Notes
     -----
@@ -73,10 +73,7 @@ class Iso230Budget:
     environmental_variation_um: float | None = None
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name.split("_")[0] not in ("difference", "nominal") and value is not None and value < 0:
-                raise InterferometryError(f"{field.name}={value} is negative; a standard uncertainty is 0 or more")
+        check_uncertainties(self, signed=("difference_from_20_degC_K", "nominal_expansion_ppm_per_K"))
 
     @property
     def is_scatter_alone(self) -> bool:

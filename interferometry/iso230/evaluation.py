@@ -104,7 +104,7 @@ def evaluate_iso230(
     >>> {name: float(result[name]) for name in QUANTITIES}
     {'B': 2.0, 'R': 2.0, 'E': 6.0, 'M': 4.5, 'A': 6.0}
     """
-    check_dataset(deviations, "deviations")
+    deviations = check_dataset(deviations, "deviations", rotary=True)
     unit = deviations["deviation"].attrs.get("units", "um")
     if unit == "arcsec" and budget is not None and not budget.is_scatter_alone:
         raise InterferometryError(

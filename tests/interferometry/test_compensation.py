@@ -167,7 +167,7 @@ def test_uncertainty_follows_the_sensitivities(campaign):
     parts = [every[name] for name in ("air_u", "material_u", "dead_path_u")]
     assert all(float(part.max()) > 0 for part in parts)
     np.testing.assert_allclose(every["compensation_u"] ** 2, sum(part**2 for part in parts))
-    with pytest.raises(CompensationError, match="formula_ppm=-1 is negative"):
+    with pytest.raises(CompensationError, match="formula_ppm=-1: give a finite number, 0 or more"):
         SensorUncertainty(formula_ppm=-1)
 
 

@@ -54,13 +54,60 @@ def test_an_evaluation_refuses_what_is_no_dataset_of_deviations(entry, rng):
         r"is of type NoneType, not a Dataset; give what read_deviations or build_deviations returns": None,
         r"has no variable 'deviation' \(cycle, direction, target\); give what read_deviations": xr.Dataset(),
         r"has no variable 'position' \(target\); give": good.drop_vars("position"),
-        r"has 'deviation' over \(target, cycle, direction\) instead of 'deviation' \(cycle,": good.transpose(
-            "target", ...
-        ),
+        r"has 'deviation' over \(cycle, target\) instead of 'deviation' \(cycle,": good.isel(direction=0),
     }
     for message, dataset in faults.items():
         with pytest.raises(InterferometryError, match=f"deviations {message}"):
             ENTRIES[entry](dataset)
+
+
+def in_unit(dataset: xr.Dataset, name: str, unit: str, factor: float = 1.0, offset: float = 0.0) -> xr.Dataset:
+    changed = dataset[name].copy(data=dataset[name].values * factor + offset)
+    return dataset.assign({name: changed.assign_attrs(units=unit)})
+
+
+@pytest.mark.parametrize("entry", [name for name in ENTRIES if name != "compensate"])
+def test_deviations_in_another_unit_or_order_give_the_same_and_of_another_quantity_are_refused(entry, rng):
+    good = simulate(rng, cycles=4)[0]
+    expected = ENTRIES[entry](good)
+    other = in_unit(in_unit(good, "deviation", "mm", 1e-3), "position", "m", 1e-3).transpose("target", ...)
+    xr.testing.assert_allclose(ENTRIES[entry](other), expected, rtol=1e-9)
+    for unit in ("um/s", "degC", "1"):
+        with pytest.raises(
+            InterferometryError, match=rf"deviations\['deviation'\] is in '{unit}', which cannot be conv.* 'um'"
+        ):
+            ENTRIES[entry](in_unit(good, "deviation", unit))
+
+
+def test_angles_are_evaluated_by_iso_230_2_alone(rng):
+    angles = in_unit(in_unit(simulate(rng, cycles=4)[0], "deviation", "arcsec"), "position", "deg")
+    assert evaluate_iso230(angles)["A"].attrs["units"] == "arcsec"
+    assert float(evaluate_iso230(in_unit(angles, "deviation", "arcmin", 1 / 60))["A"]) == pytest.approx(
+        float(evaluate_iso230(angles)["A"])
+    )
+    with pytest.raises(InterferometryError, match=r"\['deviation'\] is in 'arcsec', which cannot be converted to 'um'"):
+        estimate_drift(angles)
+
+
+def test_conditions_in_other_units_are_converted(rng):
+    good = simulate(rng, cycles=4)[0]
+    values = {
+        "air_temperature": (20.0, "degC"),
+        "air_pressure": (1000.0, "hPa"),
+        "relative_humidity": (50.0, "%"),
+        "material_temperature": (21.0, "degC"),
+    }
+    time = [good["time"].values.min(), good["time"].values.max()]
+    log = xr.Dataset(
+        {name: ("time", [value] * 2, {"units": unit}) for name, (value, unit) in values.items()}, {"time": time}
+    )
+    other = in_unit(in_unit(log, "air_pressure", "Pa", 100.0), "material_temperature", "K", 1.0, 273.15)
+    expected, found = (compensate(good, one, applied_factor_um=(0.31638, 0.31638)) for one in (log, other))
+    assert found["correction_scale"].values == pytest.approx(expected["correction_scale"].values, abs=1e-9)
+    with pytest.raises(
+        InterferometryError, match=r"environment\['air_pressure'\] is in 'psi', which cannot be converted to 'hPa'"
+    ):
+        compensate(good, in_unit(log, "air_pressure", "psi"))
 
 
 def test_anomalies_and_compensation_name_which_dataset_is_wrong(rng):

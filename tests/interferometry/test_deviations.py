@@ -98,3 +98,22 @@ def test_a_correction_does_not_change_in_what_steps_readings_were_recorded(rng):
     corrected = read.assign(deviation=read["deviation"] + rng.normal(0, 0.1, (10, 2, 2)))
     assert resolution_um(read) == resolution_um(corrected) == resolution_um(read.drop_vars("resolution")) == 1.0
     assert resolution_um(corrected.drop_vars("resolution")) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"cycles": [1, 1]}, r"cycles holds a value twice: \[1, 1\]"),
+        ({"targets": [2, 2]}, "targets holds a value twice"),
+        ({"position_mm": [10.0, 10.0]}, "position_mm holds a value twice"),
+        ({"position_mm": [0.0, np.nan]}, "must be finite"),
+        ({"deviation_um": np.full((2, 2, 2), np.inf)}, "must be finite"),
+        ({"deviation_um": np.full((2, 2, 2), "1.5 um")}, "deviation_um holds what is no number"),
+    ],
+)
+def test_arrays_that_make_no_test_are_refused(given, message):
+    arrays = {"cycles": [1, 2], "targets": [1, 2], "position_mm": [0, 10], "deviation_um": np.zeros((2, 2, 2)).tolist()}
+    time = np.full((2, 2, 2), "2026-03-09T06:30").tolist()
+    assert build_deviations(**arrays, time=time)["time"].dtype == "datetime64[ns]"
+    with pytest.raises(InterferometryError, match=message):
+        build_deviations(**(arrays | given), time=time)

@@ -123,6 +123,10 @@ def detect_hotspots(
     >>> round(spot.x_mm), round(spot.y_mm), round(spot.peak_rise_K, 1)
     (150, 70, 2.0)
     """
+    if not isinstance(rise, xr.DataArray):
+        raise ThermographyError(
+            f"rise is of type {type(rise).__name__}; give a DataArray, as temperature_rise of what reduce_frames returns"
+        )
     if rise.dims[-2:] != ("y", "x") or rise.ndim not in (2, 3) or min(rise.shape[-2:]) < 3:
         raise ThermographyError(
             f"rise has dims {rise.dims} and shape {rise.shape}; give (y, x) or (cycle, y, x) of 3 x 3 cells or more"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -58,8 +59,9 @@ class PlanGrid:
 
     def __post_init__(self) -> None:
         for name in ("width_mm", "height_mm", "cell_size_mm"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ThermographyError(f"{name} = {getattr(self, name)} mm; the plan needs a positive length")
+            length = getattr(self, name)
+            if not isinstance(length, Real) or not 0 < float(length) < np.inf:
+                raise ThermographyError(f"{name} = {length} mm; the plan needs a positive length")
         for name, side in (("width_mm", self.width_mm), ("height_mm", self.height_mm)):
             cells = side / self.cell_size_mm
             if abs(cells - round(cells)) > 1e-6:

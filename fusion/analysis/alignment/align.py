@@ -14,12 +14,16 @@ import scipy
 import xarray as xr
 from numpy.typing import NDArray
 
+from fusion.analysis.alignment.readings import check_readings
 from fusion.analysis.alignment.reflections import find_switching_patch, seen_throughout
 from fusion.analysis.alignment.sensor_health import SensorFault
 from fusion.common import Array, FusionError
 from fusion.results.parts import ContactSensorPart
+from interferometry.common import ENVIRONMENT_ATTRIBUTES
 from interferometry.deviations import resolution_um
 from thermofuse.resources import variables
+from thermofuse.units import conform
+from thermography.common import FIELD_ATTRIBUTES, FIELDS
 from thermography.large_arrays import in_pieces, piece_slices
 
 _DIMS = ("cycle", "direction", "target")
@@ -43,10 +47,25 @@ class AxisGeometry:
         Plan point (x, y) under the spindle at axis position 0.
     direction : (float, float)
         Direction (x, y) in which that point moves over the plan as the axis position grows, of any length.
+
+    Raises
+    ------
+    AlignmentError
+        Either is no pair of finite numbers, or the direction is (0, 0).
     """
 
     origin_mm: tuple[float, float]
     direction: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        try:
+            pairs = np.array([self.origin_mm, self.direction], float)
+        except (TypeError, ValueError):
+            pairs = np.empty(0)
+        if pairs.shape != (2, 2) or not np.isfinite(pairs).all() or not pairs[1].any():
+            raise AlignmentError(
+                f"origin_mm={self.origin_mm!r}, direction={self.direction!r}: give finite (x, y) of each, and a direction other than (0, 0)"
+            )
 
     @property
     def step(self) -> Array:
@@ -92,6 +111,10 @@ def cycle_bounds(deviations: xr.Dataset) -> NDArray[np.datetime64]:
     >>> (np.diff(cycle_bounds(readings)) / np.timedelta64(1, "s")).ravel().tolist()
     [600.0, 600.0]
     """
+    if not isinstance(deviations, xr.Dataset) or "time" not in deviations or "cycle" not in deviations:
+        raise AlignmentError(
+            "deviations has no 'time' over 'cycle'; give what read_deviations or build_deviations returns"
+        )
     times = deviations["time"].values.reshape(deviations.sizes["cycle"], -1)
     empty = np.isnat(times).all(axis=1)
     if empty.any():
@@ -153,7 +176,8 @@ def align(
     Raises
     ------
     AlignmentError
-        If frames and readings do not overlap in time, or if the measured line leaves the seen plan.
+        If frames and readings do not overlap in time, if the measured line leaves the seen plan, or if a Dataset lacks a variable or holds
+        it in a unit that cannot be converted.
 
     Notes
     -----
@@ -174,6 +198,11 @@ def align(
     >>> align(deviations, fields, AxisGeometry((20.0, 20.0), (1.0, 0.0)))["axis_integral"].values[-1, 0].round(6).tolist()
     [0.0, 200.0]
     """
+    deviations = check_readings(deviations, "deviations", "read_deviations or build_deviations", AlignmentError)
+    needs = {"frame_temperature": FIELDS["frame_temperature"][0]}
+    fields = conform(fields, needs, FIELD_ATTRIBUTES, name="fields", source="reduce_frames", error=AlignmentError)
+    if not isinstance(axis, AxisGeometry):
+        raise AlignmentError(f"axis is of type {type(axis).__name__}; give an AxisGeometry")
     frame_time = fields["time"].values.astype("datetime64[ns]")
     reading_time = deviations["time"].values.astype("datetime64[ns]")
     _check_overlap(reading_time, frame_time)
@@ -207,6 +236,10 @@ def _add_logs(fused: xr.Dataset, environment: xr.Dataset | None, drivers: xr.Dat
     for table, dim in ((environment, "environment_time"), (drivers, "driver_time")):
         if table is None:
             continue
+        log = dim.removesuffix("_time")
+        table = conform(
+            table, {"time": ("time",)}, ENVIRONMENT_ATTRIBUTES, name=log, source=f"read_{log}", error=AlignmentError
+        )
         log_time = table["time"].values.astype("datetime64[ns]")
         added: dict[str, tuple[tuple[str, ...], NDArray[np.generic], dict[str, object]]] = {}
         for name, column in table.data_vars.items():
@@ -286,7 +319,7 @@ class MeasuredLine:
             k = int(lost[0])
             raise AlignmentError(
                 f"the measured line leaves the plan: axis position {self.along_mm[k]:.1f} mm lies at x = {x0[k]:.1f} mm, "
-                f"y = {y0[k]:.1f} mm; check [plan.axis] origin and direction, and [plan] size"
+                f"y = {y0[k]:.1f} mm; check origin and direction of the axis, and the size of the plan"
             )
 
     def sample(self, frames: Array | xr.DataArray) -> Array:
@@ -307,7 +340,7 @@ class MeasuredLine:
         for values, seen in zip(line, number > 0, strict=True):
             if not seen.any():
                 raise AlignmentError(
-                    "no part of the measured line is seen by the camera; check [plan.axis] and the fiducials"
+                    "no part of the measured line is seen by the camera; check origin and direction of the axis, and the fiducials"
                 )
             values[~seen] = np.interp(self.along_mm[~seen], self.along_mm[seen], values[seen])
         return line
@@ -344,7 +377,7 @@ def _check_overlap(reading_time: NDArray[np.datetime64], frame_time: NDArray[np.
         start, end, first, last = both_ends(frame_time, timed)
         raise AlignmentError(
             f"frames ({start} .. {end}) and readings ({first} .. {last}) do not overlap in time; check the time zone of both clocks and "
-            "[thermography] clock_offset (camera clock minus laser clock)"
+            "the offset of the camera's clock (clock_offset, camera minus laser)"
         )
 
 

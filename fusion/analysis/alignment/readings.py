@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.common import Array, FusionError
+from interferometry.common import DEVIATION_ATTRIBUTES, DEVIATIONS
+from thermofuse.resources import variables
+from thermofuse.units import conform
 from thermography.common import scatter_by_median
 
 if TYPE_CHECKING:
@@ -28,6 +31,13 @@ _GAP_INTERVALS = 5.0
 
 class ReadingsError(FusionError):
     """A campaign with too few readings to be modelled; the message says what is missing."""
+
+
+def check_readings(dataset: xr.Dataset, name: str, source: str, error: type[FusionError]) -> xr.Dataset:
+    """Return deviations, or what was aligned with them, in the units of their contracts; refuse what lacks deviation, time or position."""
+    needs = {variable: DEVIATIONS[variable][0] for variable in ("deviation", "time", "position")}
+    described = DEVIATION_ATTRIBUTES | variables("aligned")[1]
+    return conform(dataset, needs, described, name=name, source=source, error=error)
 
 
 @dataclass(frozen=True)
@@ -217,6 +227,7 @@ def sample_noise(samples: Array) -> float:
 
 def read_fused(fused: xr.Dataset) -> Readings:
     """Return the readings of an aligned campaign."""
+    fused = check_readings(fused, "fused", "align", ReadingsError)
     deviation = fused["deviation"].values
     time = fused["time"].values.astype("datetime64[ns]")
     present = np.isfinite(deviation) & ~np.isnat(time)

@@ -25,6 +25,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.first_order_lag import respond
+from fusion.analysis.alignment.readings import check_readings
 from fusion.analysis.attribution.drift_channels import (
     ClockedReadings,
     DriftSeries,
@@ -53,6 +54,8 @@ from fusion.common import Array, FusionError
 from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart, Sensitivity
 from thermofuse.resources import variables
+from thermofuse.units import conform
+from thermography.common import FIELD_ATTRIBUTES, FIELDS
 from thermography.large_arrays import piece_slices
 
 # Places on the plan as areas: the cells that belong together around a peak, and the rectangle that names them.
@@ -188,9 +191,14 @@ def correlate(
     >>> maps.attrs["verdict"], round(float(maps["sensitivity"].sel(channel="common", x=20, y=10)), 2)
     ('attributable', 1.02)
     """
-    field = coarsen_field(fields) if isinstance(fields, xr.Dataset) else fields
-    if field.dims != ("time", "y", "x"):
-        raise CorrelationError(f"fields has dims {field.dims}; expected ('time', 'y', 'x')")
+    fused = check_readings(fused, "fused", "align", CorrelationError)
+    dims = FIELDS["frame_temperature"][0]
+    plan = fields.to_dataset(name="frame_temperature") if isinstance(fields, xr.DataArray) else fields
+    described = FIELD_ATTRIBUTES | ({} if isinstance(fields, xr.Dataset) else {"frame_temperature": {}})
+    plan = conform(
+        plan, {"frame_temperature": dims}, described, name="fields", source="reduce_frames", error=CorrelationError
+    )
+    field = coarsen_field(plan) if isinstance(fields, xr.Dataset) else plan["frame_temperature"]
     # The drift is a course over the cycles as they were measured.
     readings = clock_readings(fused.sortby("cycle"), field["time"].values.astype("datetime64[ns]"))
     candidates = _Candidates.collect(field, readings.frame_seconds, regions)

@@ -16,10 +16,11 @@ import numpy as np
 import xarray as xr
 from scipy import special
 
-from fusion.analysis.alignment.readings import known_mean
+from fusion.analysis.alignment.readings import check_readings, known_mean
 from fusion.analysis.diagnosis.causes import CAUSES, undetermined_check
 from fusion.analysis.diagnosis.explanations import (
     LAGS_S,
+    DiagnosisError,
     ProfileFit,
     RandomWalkFit,
     Residual,
@@ -179,6 +180,7 @@ def diagnose(fused: xr.Dataset, anomalies: Sequence[Flagged], *, seed: int = 0) 
     >>> diagnosis.cause, diagnosis.evidence["step_cycle"]
     ('step', 21)
     """
+    fused = check_readings(fused, "fused", "align", DiagnosisError)
     flagged = {int(anomaly.target) for anomaly in anomalies}
     cases = {target: _fit_explanations(fused, target, flagged, seed) for target in sorted(flagged)}
     return [_judge(cases[int(anomaly.target)], str(anomaly.direction)) for anomaly in anomalies]

@@ -491,13 +491,13 @@ def declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, E
         candidates = list(effects[name].candidates(readings, {}, None))
         if len(candidates) != 1:
             raise LoopError(
-                f"declared effect {name!r} has parameters that are not known beforehand; leave it out of [model] declared, the "
+                f"declared effect {name!r} has parameters that are not known beforehand; leave it out of declared, the "
                 "search tries it anyway"
             )
         if not np.any(candidates[0].columns):
             raise LoopError(
                 f"declared effect {name!r} is zero at every reading: what it follows does not change during the test; check that the "
-                "frames are not copies of one (camera frozen) and that the logs move, or leave it out of [model] declared"
+                "frames are not copies of one (camera frozen) and that the logs move, or leave it out of declared"
             )
         terms.append(Term(name, replace(candidates[0], prior=effects[name].prior)))
     return terms

@@ -14,8 +14,9 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array
 
+from fusion.app.parts import PathError
 from fusion.campaign.draft import DRAFTED, TO_FILL, Asker, draft_lines
-from fusion.campaign.inspect import scan_folder
+from fusion.campaign.inspect import leads_out, scan_folder
 from fusion.common import FusionError
 from fusion.results.store import write_atomically
 
@@ -88,12 +89,14 @@ class CampaignText:
         return CampaignText(self.path, text, text)
 
 
-def open_campaign(folder: Path) -> CampaignText:
-    """Open the campaign file of a folder, or draft one where there is none."""
-    path = folder / _FILE
+def open_campaign(folder: Path, root: Path | None = None) -> CampaignText:
+    """Open the campaign file of a folder, or draft one where there is none; links out of `root`, else of the folder, are not followed."""
+    path, root = folder / _FILE, root or folder
+    if leads_out(path, root):
+        raise PathError(f"{path} is a link to a place outside {root}; copy the file into the folder")
     if path.exists():
         return read_campaign(path)
-    return CampaignText(path, "\n".join(draft_lines(scan_folder(folder), Asker(None))) + "\n", None)
+    return CampaignText(path, "\n".join(draft_lines(scan_folder(folder, within=root), Asker(None))) + "\n", None)
 
 
 def read_campaign(path: Path) -> CampaignText:

@@ -57,7 +57,7 @@ class Opened:
 
 def open_folder(root: Path, folder: Path) -> Opened:
     """Read what the screen shows of a folder."""
-    content, campaign = scan_folder(folder), open_campaign(folder)
+    content, campaign = scan_folder(folder, within=root), open_campaign(folder, root)
     remarks: list[str] = []
     if campaign.saved is None and (tests := separate_tests(content)):
         remarks.append(

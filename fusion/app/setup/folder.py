@@ -7,14 +7,15 @@ from pathlib import Path
 import panel as pn
 
 from fusion.app.parts import PathError, allowed_folder, allowed_path, file_name, heading, paragraph, table
-from fusion.campaign.inspect import Inspected, Kind, inspect_paths
+from fusion.campaign.inspect import Inspected, Kind, inspect_paths, leads_out
 from fusion.common import FusionError
 from fusion.results.store import write_atomically
 
 
-def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
-    """Return what a folder holds, as parts of a screen."""
-    looked_into = list(inspect_paths([folder]))
+def found_in_folder(folder: Path, root: Path | None = None) -> list[pn.viewable.Viewable]:
+    """Return what a folder holds, as parts of a screen; links out of `root`, else of the folder, are named and not followed."""
+    root = root or folder
+    looked_into = list(inspect_paths([folder], within=root))
     if [one.label for one in looked_into] == [str(folder)]:
         return [paragraph(f"{folder} holds no file; put the files of the measurement into it", kind="fault")]
     usable = [one for one in looked_into if not one.fault]
@@ -30,6 +31,10 @@ def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
         parts += [paragraph(f"{name}: {line.removeprefix('warning: ')}", kind="warning") for line in one.warnings]
         if one.fault:
             parts.append(paragraph(f"{name} is not used: {one.fault}", kind="fault" if one.fails else "warning"))
+    for path in sorted(folder.iterdir()):
+        if leads_out(path, root):
+            told = f"{path.name} is a link to a place outside {root} and is not followed; copy what it leads to into the folder"
+            parts.append(paragraph(told, kind="warning"))
     return parts
 
 

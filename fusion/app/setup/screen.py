@@ -47,7 +47,7 @@ class SetUpScreen:
             ui.schedule_parts(self._dropped, [])
             ui.schedule_parts(self._below, [])
             ui.schedule_parts(self._found, [ui.note("Looking into the files ...")])
-            found += await asyncio.to_thread(found_in_folder, folder)
+            found += await asyncio.to_thread(found_in_folder, folder, self._state.root)
             ui.schedule_parts(self._found, [*found, ui.note("Reading the first frame and the recordings ...")])
             opened = await asyncio.to_thread(_open, self._state.root, folder)
             ui.schedule_parts(self._found, found)

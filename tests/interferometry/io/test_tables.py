@@ -7,7 +7,6 @@ import pytest
 
 from interferometry.io.faults import BadReading, LaserFormatError
 from interferometry.io.tables import (
-    UNITS,
     DateOrder,
     decode_text,
     describe_time_zone,
@@ -18,6 +17,7 @@ from interferometry.io.tables import (
     read_table,
     read_timed_rows,
 )
+from thermofuse.units import UNITS
 
 
 def written(folder: Path, text: str) -> Path:

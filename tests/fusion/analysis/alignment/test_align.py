@@ -315,3 +315,59 @@ def test_a_recording_that_covers_or_never_can_has_no_shift() -> None:
     assert likely_zone_shift(READINGS, span(-60, 4 * 3600 + 60)) is None
     assert likely_zone_shift(READINGS, span(0, 2 * 3600)) is None
     assert likely_zone_shift(READINGS, span(100 * 3600, 104 * 3600)) is None
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction"),
+    [
+        ((np.nan, 90.0), (1.0, 0.0)),
+        ((500.0, 90.0), (0.0, 0.0)),
+        ((500.0,), (1.0, 0.0)),
+        ("ab", (1.0, 0.0)),
+        ((500.0, 90.0), (np.inf, 0.0)),
+    ],
+)
+def test_an_axis_without_place_or_direction_is_refused(origin, direction):
+    with pytest.raises(AlignmentError, match=r"origin_mm=.*, direction=.*: give finite \(x, y\) of each"):
+        AxisGeometry(origin, direction)
+
+
+def in_units(dataset, **units):
+    """Values in other units: unit, and factor and offset from the old one."""
+    for name, (unit, factor, offset) in units.items():
+        array = dataset[name].copy(data=dataset[name].values * factor + offset).assign_attrs(units=unit)
+        dataset = dataset.assign_coords({name: array}) if name in dataset.coords else dataset.assign({name: array})
+    return dataset
+
+
+def test_readings_and_fields_in_other_units_are_converted():
+    readings, field = deviations(), fields(lambda x, y, s: 1e-4 * s * (500.0 - x) / 100.0 + 0 * y)
+    readings["deviation"] += np.arange(16.0)
+    expected = align(readings, field, AXIS)
+    other = align(
+        in_units(readings, position=("m", 1e-3, 0.0), deviation=("nm", 1e3, 0.0)),
+        in_units(field, x=("m", 1e-3, 0.0), y=("inch", 1 / 25.4, 0.0), frame_temperature=("degF", 1.8, 32.0)),
+        AXIS,
+    )
+    for name in ("position", "deviation", "axis_integral", "mean_rise", "local_rise"):
+        np.testing.assert_allclose(other[name], expected[name], atol=1e-6)
+
+
+def test_an_argument_that_is_not_what_it_should_be_is_named():
+    readings, field = deviations(), fields(lambda x, y, s: s + 0 * x + 0 * y)
+    seconds = in_units(field, frame_temperature=("s", 1.0, 0.0))
+    faults = {
+        r"deviations is of type NoneType, not a Dataset; give what read_deviations": (None, field, AXIS),
+        r"fields has no variable 'frame_temperature' \(time, y, x\); give what reduce_frames": (
+            readings,
+            readings,
+            AXIS,
+        ),
+        r"fields\['frame_temperature'\] is in 's', which cannot be converted to 'degC'": (readings, seconds, AXIS),
+        r"axis is of type tuple; give an AxisGeometry": (readings, field, ((500.0, 90.0), (-1.0, 0.0))),
+    }
+    for message, arguments in faults.items():
+        with pytest.raises(AlignmentError, match=message):
+            align(*arguments)
+    with pytest.raises(AlignmentError, match="deviations has no 'time' over 'cycle'; give what read_deviations"):
+        cycle_bounds(field)

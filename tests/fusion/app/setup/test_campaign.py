@@ -320,3 +320,25 @@ def test_no_name_leads_out_of_the_folder(tmp_path):
     with pytest.raises(PathError):
         store_upload(tmp_path / "in", tmp_path, "x", b"x")
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+def test_links_out_of_the_folder_are_named_and_not_followed(tmp_path):
+    outside, folder = tmp_path / "outside", tmp_path / "folder"
+    outside.mkdir()
+    folder.mkdir()
+    (outside / "notes.csv").write_text("user secret-password\n")
+    (outside / "campaign.toml").write_text('[campaign]\ntitle = "secret-password"\n')
+    (folder / "notes.csv").symlink_to(outside / "notes.csv")
+    (folder / "below").symlink_to(outside)
+    (folder / "laser.csv").write_text("cycle,direction,target,position_mm,time,deviation_um\n")
+    (folder / "copy.csv").symlink_to(folder / "laser.csv")
+    shown = "".join(part.object for part in found_in_folder(folder))
+    assert "secret-password" not in shown
+    assert (
+        all(f"{name} is a link to a place outside" in shown for name in ("notes.csv", "below"))
+        and "copy.csv is" in shown
+    )
+    assert "notes.csv" not in open_campaign(folder).text
+    (folder / "campaign.toml").symlink_to(outside / "campaign.toml")
+    with pytest.raises(PathError, match="is a link to a place outside"):
+        open_campaign(folder)
