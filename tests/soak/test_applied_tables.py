@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusion.analysis.comparison import compare_profiles, find_table_fault, take_out
-from fusion.report.exports.controls import ErrorTable, read_profile, read_scatter_and_drift, tabulate
+from fusion.report.exports.controls import ActiveTable, ErrorTable, read_profile, read_scatter_and_drift, tabulate
 from fusion.report.exports.export import predict_test
 from fusion.results.parts import ByDirection, TablePrediction
 from fusion.results.store import joined
@@ -137,5 +137,34 @@ def test_a_test_in_the_same_thermal_state_is_as_predicted(cycles: int, drift_um:
     rms = {symbol: float(np.sqrt(np.mean(np.square(one)))) for symbol, one in off.items()}
     inside = {symbol: rate(int((np.abs(one) <= 2.0).sum()), RUNS) for symbol, one in off.items()}
     print(f"\n{cycles} cycles, drift {drift_um} um, one table {one_table}: error over u", rms, "within 2u", inside)
-    # Of 40 axes the rms is known within 11 %; that of A holds no uncertainty of the course of the drift within the window.
-    assert all(0.6 < one < (2.0 if symbol == "A" else 1.5) for symbol, one in rms.items())
+    # Of 40 axes the rms is known within 11 %: three of these about 1, and a tenth for the course of the drift, which is taken as known.
+    assert all(0.65 < one < 1.45 for one in rms.values())
+
+
+def test_the_sum_with_the_table_that_was_active_leaves_least() -> None:
+    """E of a second test without drift: as tested, with the new table in place of the active one, and with the sum of both."""
+    found = []
+    for run in range(RUNS):
+        rng = np.random.default_rng(first_seed(5500) + run)
+        errors, at = axis(rng), np.arange(-10.0, 311.0, 16.0)
+        # An old table: what the axis had once, which is not what it has now.
+        old = np.array(
+            [np.interp(at, POSITION, one) for one in errors + np.cumsum(rng.normal(0.0, 0.5, (2, 16)), axis=1)]
+        )
+        active = ActiveTable("old.comp", at, old - old[0, 0])
+        first = measure(rng, errors - active.at(POSITION), cycles=10, drift_um=1.0)
+        known = read_profile(joined(first, drift=estimate_drift(first)))
+        table = tabulate(known, active=active)
+        added, old_there = table.added_um(POSITION, one_table=False), active.at(POSITION)
+        left = [errors - one for one in (old_there, added, old_there + added)]
+        np.testing.assert_allclose(
+            ErrorTable.added_um(table, POSITION, one_table=False) + old_there,
+            np.array([np.interp(POSITION, table.position_mm, one) for one in table.deviation_um]),
+            atol=1e-9,
+        )
+        found.append([float(evaluate_iso230(measure(rng, one, cycles=5, drift_um=0.0))["E"]) for one in left])
+    tested, replaced, both = np.median(found, axis=0)
+    print(
+        f"\nE as tested {tested:.2f} um, new table in place of the active one {replaced:.2f} um, sum of both {both:.2f} um"
+    )
+    assert both < 0.5 * tested < replaced

@@ -126,6 +126,7 @@ def verify(
             replayed.correction[known, k],
             there[known],
             responses[before.channels.index(output.name)],
+            {one.name: replayed.correction[known, j] for j, one in enumerate(model.outputs) if j != k},
         )
         draws = second.draw_ranges()
         low, high = np.quantile(draws, [(1.0 - _COVERAGE) / 2.0, (1.0 + _COVERAGE) / 2.0]).tolist()
@@ -194,13 +195,16 @@ def _readings(after: Record, model: Recursion, faulty: Mapping[str, str]) -> Arr
 
 @dataclass(frozen=True)
 class _Second:
-    """One displacement in the second test: its blocks (n,), what was measured and corrected, um, the columns (n, p), and their response."""
+    """One displacement in the second test: its blocks (n,), what was measured and corrected, um, the columns (n, p), their response, and
+    the corrections of the others.
+    """
 
     seconds: Array
     course: Array
     correction: Array
     columns: Array
     response: Response
+    others: Mapping[str, Array]
 
     @property
     def _left_open(self) -> Array:
@@ -243,6 +247,8 @@ class _Second:
             columns = np.column_stack([self._left_open, NAMED_U * self.correction])
             yield name, self._bare - gain * self.correction, columns
         yield "wrong scale", self._bare, np.column_stack([self._left_open, SCALE_U * self.correction])
+        for name, correction in self.others.items():
+            yield f"axis exchanged with {name}", self._bare - correction, self._left_open
         # Any table of such states, which need not know the machine.
         yield _STALE, self._bare, np.column_stack([self._left_open, self.columns * self.response.prior_u])
 

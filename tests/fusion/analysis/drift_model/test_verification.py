@@ -88,6 +88,16 @@ def test_a_driver_in_another_unit_than_the_model_reads_is_refused(first):
         verify(product, loop, after, driven, faulty_sensors={})
 
 
+def test_outputs_that_are_exchanged_are_named(first):
+    one, other = first[2].outputs
+    swapped = (
+        one.model_copy(update={"coefficients": other.coefficients}),
+        other.model_copy(update={"coefficients": one.coefficients}),
+    )
+    for verdict in verified(first, runs=first[2].model_copy(update={"outputs": swapped})):
+        assert verdict.fault == f"axis exchanged with {other.name if verdict.name == one.name else one.name}"
+
+
 def test_other_coefficients_are_named(first):
     swapped = [one.model_copy(update={"coefficients": one.coefficients[::-1]}) for one in first[2].outputs]
     for one in verified(first, runs=first[2].model_copy(update={"outputs": tuple(swapped)})):
