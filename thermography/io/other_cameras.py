@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import xarray as xr
 
+from thermofuse.resources import vocabulary
 from thermography.common import ZERO_CELSIUS_K, ThermographyError
 from thermography.io.flir import FlirReader, index_files
 from thermography.io.frame import CalibratedRange, CameraParameters, FrameReference, RejectedFrame
@@ -314,6 +315,9 @@ def to_utc(path: Path, stamp: datetime, zone: str) -> np.datetime64:
 
 # Frames of temperatures as arrays: TIFF, NumPy, NetCDF and Zarr.
 
+_WORDS = vocabulary("frames")
+#: Name of a dimension -> what runs along it.
+_ALONG = {name: role for role, names in _WORDS["dimensions"].items() for name in names}
 #: Units of temperature as CF and common programs write them.
 _UNITS = {
     **dict.fromkeys(("degC", "deg_C", "celsius", "Celsius", "degree_Celsius", "degrees_Celsius", "degrees_C", "°C", "C"), "degC"),
@@ -429,14 +433,6 @@ class NumpyReader(TemperatureReader):
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a frame, (row, column)."""
         return np.array(self._open(path)[index])
-
-
-#: What a dimension, or the attribute `axis` of its coordinate, is called -> what runs along it.
-_ALONG = {
-    **dict.fromkeys(("time", "t", "frame", "frames"), "frame"),
-    **dict.fromkeys(("y", "row", "rows", "lat", "latitude", "height"), "row"),
-    **dict.fromkeys(("x", "column", "columns", "col", "cols", "lon", "longitude", "width"), "column"),
-}
 
 
 class _Pictures(NamedTuple):
@@ -1031,59 +1027,18 @@ def read_stack(path: Path) -> Stack:
     return Stack(reader, reader.frame_contents(path, stored), reader.read_values(path, 0, stored))
 
 
-_VIDEO = "a video of colours (MP4, MOV or AVI) without temperatures; record radiometric video (.seq, .csq), or take single pictures"
-_EXPORT = "export it as CSV or TIFF of temperatures in the program that reads it"
-_TABLE = "a table in a binary file; save it as CSV or XLSX"
-#: First byte and bytes, or ending, of files that are not read -> what they are and what to do instead.
-_NOT_READ: dict[tuple[int, bytes] | str, str] = {
-    (4, b"ftyp"): _VIDEO,
-    (0, b"RIFF"): _VIDEO,
-    (0, b"AFF\0"): f"an AFF sequence of a cooled FLIR camera, whose layout is not public; {_EXPORT}",
-    (
-        0,
-        b"MATLAB ",
-    ): 'a MATLAB file; write its frames in MATLAB as CSV, writematrix(frame, "frame.csv"), or as TIFF, one per file',
-    (0, b"SIMPLE  ="): "a FITS file; save its frames as .npy (numpy.save), TIFF or CSV",
-    (
-        0,
-        b"\x76\x2f\x31\x01",
-    ): "an OpenEXR picture, as a run writes its maps; name the frames from which they were made, or save it as TIFF",
-    (0, b"CDF\5"): "a NetCDF file with 64-bit data (CDF-5); convert it: nccopy -k nc4 FILE NEW.nc",
-    (0, b"PAR1"): _TABLE,
-    (0, b"ARROW1"): _TABLE,
-    (0, b"FEA1"): _TABLE,
-    (0, b"TDSm"): "a TDMS file of LabVIEW; export it as CSV or XLSX there",
-    (0, b"\x1f\x8b"): "a file packed by gzip; unpack it",
-    (0, b"Rar!"): "an archive; unpack it",
-    (0, b"7z\xbc\xaf"): "an archive; unpack it",
-    (0, b"\xffIRB"): f"a recording of InfraTec, whose layout is not public; {_EXPORT}",
-    ".irb": f"a recording of InfraTec, whose layout is not public; {_EXPORT}",
-    ".ats": f"an ATS recording of FLIR ResearchIR or Research Studio, whose layout is not public; export it as SEQ there, or {_EXPORT}",
-    ".ptw": f"a PTW recording of FLIR Altair; {_EXPORT}",
-    ".sfmov": f"an SFMOV recording of FLIR ExaminIR; {_EXPORT}",
-    ".bmt": f"a picture of Testo, whose layout is not public; {_EXPORT}",
-    ".is2": f"a picture of Fluke, whose layout is not public; {_EXPORT}",
-    ".optris": f"raw data of an Optris camera; {_EXPORT}",
-    ".mat": 'a MATLAB file; write its frames in MATLAB as CSV, writematrix(frame, "frame.csv"), or as TIFF, one per file',
-    ".npz": "a file of several NumPy arrays; save the frames alone as (frame, row, column) in a .npy, numpy.save",
-    ".pkl": "a pickle of Python, which is never opened because it may run any code; save the frames with numpy.save, a table as CSV",
-    ".rds": "a file of R; save a table with write.csv, frames as CSV or TIFF",
-    ".rdata": "a file of R; save a table with write.csv, frames as CSV or TIFF",
-    ".zip": "an archive; unpack it",
-}
-
-
 def _mark(start: bytes) -> str:
     """Say what a file that is not read is by its first bytes."""
-    marks = ((mark, why) for mark, why in _NOT_READ.items() if not isinstance(mark, str))
-    return next((why for (place, mark), why in marks if start[place:].startswith(mark)), "")
+    marks = ((bytes.fromhex(mark), one) for one in _WORDS["unread"] for mark in one.get("starts", ()))
+    return next((str(one["words"]) for mark, one in marks if start[one.get("at", 0) :].startswith(mark)), "")
 
 
 def name_unread(path: Path) -> str:
     """Say what a known file is that is not read, and what to do instead; empty for all others."""
     with path.open("rb") as file:
         start = file.read(START_BYTES)
-    return _mark(start) or _NOT_READ.get(path.suffix.lower(), "")
+    ending = path.suffix.lower()
+    return _mark(start) or next((one["words"] for one in _WORDS["unread"] if ending in one.get("endings", ())), "")
 
 
 def index_recordings(
