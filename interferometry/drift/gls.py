@@ -65,8 +65,8 @@ _LARGEST_EXCESS = 1e6
 _DEPENDENCE_TOLERANCE = 1e-10
 #: Share of the whitened response's square that each degree of freedom loses to rounding in its sums.
 _ROUNDING = float(np.finfo(float).eps)
-#: Parts of the coefficients' uncertainty that are smoothed together: their states at all readings are held.
-_SHARES_AT_ONCE = 48
+#: Values of parts of the coefficients' uncertainty that are smoothed together, 16 MB: their states at all readings are held.
+_SHARED_VALUES = 2**21
 #: Columns that fewer than this share of the readings have are few enough for their own recursion.
 _FEW_READINGS = 0.1
 #: So many fixed effects of single sites take part in the search for the variances of the drift at most.
@@ -156,8 +156,9 @@ class DriftFit:
         """Parts (p, some) of the coefficients' uncertainty that are independent, of unit variance, and what is smoothed of each."""
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        for start in range(0, root.shape[1], _SHARES_AT_ONCE):
-            some = root[:, start : start + _SHARES_AT_ONCE]
+        at_once = max(1, _SHARED_VALUES // self.response.size)
+        for start in range(0, root.shape[1], at_once):
+            some = root[:, start : start + at_once]
             yield some, self.system.smooth(self.design @ some)
 
     def noise(self) -> tuple[Array, Array]:
