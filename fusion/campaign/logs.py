@@ -277,7 +277,11 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
             values.append(numbers if unit is None else in_unit(numbers, given, unit, column=heading, path=path))
             if unit == "degC" and is_rise(numbers, given):
                 rises.append(name)
-            if unit is not None and (limits := ranges.get(heading)) is not None:
+            if (limits := ranges.get(heading)) is not None:
+                if unit != "degC":
+                    raise TableError(
+                        f'{path}: the column "{heading}" is no temperature, and has a range; remove range under [record.columns]'
+                    )
                 values[-1][(values[-1] < limits[0]) | (values[-1] > limits[1])] = np.nan
         return names, units, np.array(values).reshape(len(names), int(keep.sum())).T
 

@@ -15,8 +15,9 @@ import xarray as xr
 
 from fusion.analysis.alignment.sensor_health import examine_displacements, examine_sensors
 from fusion.analysis.drift_model.record import examine_record
-from tests.fusion.record_tables import SPINDLE, spindle_table, twin_table
-from tests.soak.rates import campaigns
+from tests.fusion.record_tables import SPINDLE, spindle_table, table_of, twin_table
+from tests.soak.rates import campaigns, first_seed, rate
+from tests.soak.simulator import Sensors, simulated_sensors, spoil_displacement, spoil_sensor
 
 pytestmark = pytest.mark.slow
 
@@ -197,3 +198,78 @@ def test_planted_displacement_faults_are_left_out_and_no_other_reading(
                     flush=True,
                 )
     assert wrong == 0
+
+
+#: Faults of one sensor of a simulated record, and how many of a hundred must be found: a drift of 15 K over the rest of a record, and what
+#: rests within its digits or is regulated, look like what a machine does.
+SPOILT = {"stuck": 0.5, "railed": 0.9, "open": 0.9, "erratic": 0.7, "bursts": 0.7, "drifting": 0.0, "jump": 0.6}
+
+
+def simulated_table(sensors: Sensors) -> xr.Dataset:
+    """The record as the reader returns it, set points as temperatures beside the sensors."""
+    names = [f"t{k + 1}" for k in range(sensors.temperature.shape[1])]
+    columns = [sensors.temperature]
+    if sensors.set_points is not None:
+        columns.append(sensors.set_points)
+        names += [f"set {k + 1}" for k in sensors.regulated]
+    table = table_of(sensors.displacement, np.column_stack(columns), sensors.load, step_s=float(sensors.seconds[1]))
+    return table.assign_coords(sensor=names)
+
+
+def test_sound_sensors_of_simulated_records_are_not_accused(capsys: pytest.CaptureFixture[str]) -> None:
+    accused, sound, found = 0, 0, dict.fromkeys(SPOILT, 0)
+    seeds = range(first_seed(8000), first_seed(8000) + 2 * RUNS)
+    for kind in ("sound", *SPOILT):
+        for seed in seeds:
+            rng = np.random.default_rng(seed)
+            sensors = simulated_sensors(rng)
+            spoilt = ""
+            if kind in SPOILT:
+                place = int(rng.integers(sensors.temperature.shape[1]))
+                spoilt = f"t{place + 1}"
+                spoil_sensor(rng, kind, sensors.seconds, sensors.temperature[:, place])
+            health = examine_record(simulated_table(sensors), ["quasi_static"])
+            named = {one.sensor for one in health.findings if one.quantity == "temperature"}
+            accused += len(named - {spoilt})
+            sound += sensors.temperature.shape[1] - (kind in SPOILT)
+            if kind in SPOILT:
+                found[kind] += spoilt in named
+    with capsys.disabled():
+        print(f"sound sensors accused: {rate(accused, sound)}; found of {len(seeds)}: {found}", flush=True)
+    assert accused <= 0.02 * sound
+    for kind, share in SPOILT.items():
+        assert found[kind] >= share * len(seeds) - 3.0 * np.sqrt(share * (1.0 - share) * len(seeds))
+
+
+def test_erratic_times_and_bursts_of_simulated_displacements_are_left_out_whole(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    whole, wrong, records = 0, 0, 0
+    for seed in range(first_seed(8000), first_seed(8000) + 4 * RUNS):
+        for kind in ("erratic", "bursts", "sound"):
+            rng = np.random.default_rng([seed, 7])
+            sensors = simulated_sensors(rng)
+            place = int(rng.integers(sensors.displacement.shape[1]))
+            at_fault = np.zeros(sensors.seconds.size, bool)
+            if kind != "sound":
+                at_fault = spoil_displacement(rng, kind, sensors.displacement[:, place])
+            columns = (
+                sensors.displacement,
+                sensors.temperature,
+                sensors.load[:, None] if sensors.load is not None else None,
+            )
+            left_out = np.zeros(sensors.displacement.shape, bool)
+            for fault in examine_displacements(sensors.seconds, *columns):
+                for first, last in fault.stretches_s:
+                    left_out[(sensors.seconds >= first) & (sensors.seconds <= last), fault.sensor] = True
+            right = left_out[:, place] & at_fault
+            records += 1
+            whole += bool((right == at_fault).all())
+            wrong += bool(left_out.sum() > right.sum())
+    with capsys.disabled():
+        print(
+            f"all faulty readings left out: {rate(whole, records)}; a sound one among them: {rate(wrong, records)}",
+            flush=True,
+        )
+    assert whole >= 0.95 * records
+    assert wrong <= 0.02 * records + 3.0

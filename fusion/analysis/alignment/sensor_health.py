@@ -313,6 +313,8 @@ _RESPONSE = 2.0
 _LEAST_SWITCHINGS = 3
 #: A change from one sample to the next, at most so far apart, is faster than any part of a machine warms, s.
 _FAST_S = 60.0
+#: A heater takes longer than this to reach its level, s: only a change from one sample to the next, that close, is none of a heater.
+_HEATER_S = 10.0
 #: Windows in which the noise of a sensor is compared, and fewest on either side of its change.
 _NOISE_WINDOWS, _LEAST_NOISE_WINDOWS = 24, 3
 #: Fewest samples of such a window.
@@ -673,11 +675,10 @@ def _changed(grids: list[Grid], kept: Sequence[int], suspects: Sequence[int]) ->
         named = survivors or [over[0]]
         responding = _responds(grids, named[0], sound)
         told = [_describe(grids, one, sound, responding=responding, alone=len(survivors) == 1) for one in named]
-        # Only a change from one sample to the next is none of heat.
         faults += [
             fault
             for fault in told
-            if (fault.kind is Kind.JUMP and grids[0].step_s <= _FAST_S)
+            if (fault.kind is Kind.JUMP and grids[0].step_s <= _HEATER_S)
             or not _is_regulated(grids[-1], fault.sensor, [j for j in kept if j != fault.sensor])
         ]
         left = [j for j in left if j not in {one.sensor for one in named}]

@@ -145,11 +145,12 @@ def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
     return last
 
 
-def predict_left_out(record: Record, columns: Array, penalty: float) -> Array:
-    """Predict every part of a record, or every run of several, from all others, earlier and later ones."""
-    numbers = record.run if record.runs else record.chained
-    parts = [numbers == number for number in np.unique(numbers)]
-    return _predict_parts(record, columns, penalty, [(~part, part) for part in parts])
+def predict_left_out(record: Record, columns: Array, penalty: float, used: NDArray[np.bool_] | None = None) -> Array:
+    """Predict every part of a record, or every run of several, from all others that are `used`, earlier and later ones."""
+    used = np.ones(record.seconds.size, bool) if used is None else used
+    numbers = record.run if np.unique(record.run[used]).size > 1 else record.chained
+    parts = [numbers == number for number in np.unique(numbers[used])]
+    return _predict_parts(record, columns, penalty, [(used & ~part, part) for part in parts])
 
 
 def predict_later(record: Record, columns: Array, penalty: float, train: NDArray[np.bool_]) -> Array:

@@ -1260,13 +1260,13 @@ class SensorHealth:
 
     @property
     def undoubted(self) -> xr.Dataset:
-        """The record without what is suspected."""
+        """The record without what is suspected; all sensors where every one is."""
         doubted = {one.sensor for one in self.findings if one.state == "suspected"}
-        kept = {
-            dimension: [name for name in self.table[dimension].values.tolist() if name not in doubted]
+        sensors, channels = (
+            [name for name in self.table[dimension].values.tolist() if name not in doubted]
             for dimension in ("sensor", "channel")
-        }
-        return self.table.sel(kept)
+        )
+        return self.table.sel(channel=channels, sensor=sensors or self.table["sensor"].values)
 
 
 #: A fault, the name of its sensor or displacement, and of several runs the one that shows it.
@@ -1300,9 +1300,12 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
     if not readings and not sensors:
         return SensorHealth(table, set_points=set_points)
 
-    def errors(of: xr.Dataset, *beside: str) -> dict[str, float]:
+    def both_errors(of: xr.Dataset, *beside: str) -> tuple[dict[str, float], dict[str, float]]:
         used = of.sel(sensor=[name for name in names if name in kept or name in beside])
         return _declared_errors(used, declared)
+
+    def errors(of: xr.Dataset, *beside: str) -> dict[str, float]:
+        return both_errors(of, *beside)[0]
 
     kept = [name for name in names if name not in dead]
     learnt = {name for fault, name, run in sensors if _is_learnt(cleaned, fault, run)}
@@ -1341,16 +1344,19 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
             ):
                 true.add(name)
     sensors = [one for one in sensors if one[1] not in true]
-    # A sensor is put back while the displacements are predicted better with it.
+    # A sensor is put back while the displacements are predicted better with it, in either way.
     out = {name: fault for fault, name, _ in sensors if fault.is_clear and name not in needed}
     kept = [name for name in names if name not in out]
     if not kept:
         kept = [name for name in names if name not in dead]
     while True:
-        without = _mean(errors(cleaned))
-        asked = {name: _mean(errors(cleaned, name)) for name in names if name in learnt - dead - {*kept}}
-        best = min(asked, key=lambda name: asked[name], default="")
-        if not best or not asked[best] < without:
+        without, left_out = map(_mean, both_errors(cleaned))
+        asked, better = {}, {}
+        for name in (name for name in names if name in learnt - dead - proven - {*kept}):
+            asked[name], beside = map(_mean, both_errors(cleaned, name))
+            better[name] = min(asked[name] / max(without, 1e-12), beside / max(left_out, 1e-12))
+        best = min(better, key=lambda name: better[name], default="")
+        if not best or not better[best] < 1.0:
             break
         kept = [*kept, best]
     found = []
@@ -1501,14 +1507,19 @@ def _repaired(table: xr.Dataset, fault: SensorFault, name: str, run: str) -> xr.
     return table.assign(temperature=temperature)
 
 
-def _declared_errors(table: xr.Dataset, declared: Sequence[str]) -> dict[str, float]:
-    """Error of the declared model by channel, um: later parts of the training time from those before, or training runs from the others."""
+def _declared_errors(table: xr.Dataset, declared: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
+    """Errors of the declared model by channel, um: later parts of the training time from those before, and every part from all others; of
+    several training runs every one from the others.
+    """
     try:
         record = reduce_record(table)
         train, _ = hold_out(record)
     except RecordError:
-        return {}
+        return {}, {}
     columns = columns_of(record, declare(declared, record))
-    predicted = predict_later(record, columns, predict(record, columns, train).penalty, train)
-    errors = channel_rmse(record.displacement - predicted)
-    return dict(zip(record.channels, errors.tolist(), strict=True))
+    penalty = predict(record, columns, train).penalty
+    later, others = (
+        channel_rmse(record.displacement - predict_parts(record, columns, penalty, train)).tolist()
+        for predict_parts in (predict_later, predict_left_out)
+    )
+    return dict(zip(record.channels, later, strict=True)), dict(zip(record.channels, others, strict=True))
