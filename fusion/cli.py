@@ -29,9 +29,9 @@ from fusion.messages import (
     leave,
     print_json,
     printable,
-    stop_at_once,
 )
 from fusion.pipeline.workers import collect_garbage_less, second_process
+from thermofuse.__main__ import stop_at_once
 
 if TYPE_CHECKING:
     from fusion.results.progress import Report

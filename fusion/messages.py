@@ -315,12 +315,6 @@ class Terminal(Console):
             yield part if part.control else Segment(printable(part.text), part.style)
 
 
-def stop_at_once(number: int, frame: FrameType | None) -> NoReturn:
-    """End the process on a signal while its libraries are loaded: nothing has been written yet that would have to be put right."""
-    os.write(2, f"thermofuse: stopped by {signal.Signals(number).name}\n".encode())
-    os._exit(_SIGNAL_BASE + number)
-
-
 # The file that an error is about.
 
 #: Characters of a name that a file may have.

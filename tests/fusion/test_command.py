@@ -17,13 +17,14 @@ class Interrupting:
             os.kill(os.getpid(), {number})
 sys.meta_path.insert(0, Interrupting())
 sys.argv = ["thermofuse", "schema", "recipe"]
-from fusion.cli import main
+from thermofuse.__main__ import main
 main()
 """
 
 
 @pytest.mark.parametrize(
-    ("library", "number"), [("pydantic", signal.SIGINT), ("fusion.twin.recipe_file", signal.SIGTERM)]
+    ("library", "number"),
+    [("typer", signal.SIGINT), ("pydantic", signal.SIGINT), ("fusion.twin.recipe_file", signal.SIGTERM)],
 )
 def test_a_signal_while_libraries_load_is_told_in_one_line(library: str, number: signal.Signals) -> None:
     text = LOADING.format(library=library, number=int(number))

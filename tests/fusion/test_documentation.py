@@ -182,4 +182,4 @@ def test_the_makefile_makes_what_the_readme_says() -> None:
     for target in re.findall(r"^make (\w+)", README, flags=re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["scripts"]["thermofuse"] == "fusion.cli:main"
+    assert project["scripts"]["thermofuse"] == "thermofuse.__main__:main"
