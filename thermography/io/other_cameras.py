@@ -763,10 +763,10 @@ def _fault_of_frames(parts: list[_Block], lines: list[str], delimiter: str) -> s
 def _plain_lines(text: str) -> tuple[list[str], str]:
     """Return the lines of a text with the minus of a keyboard and without units behind numbers, and the unit of a frame of them."""
     text = text.replace("\N{MINUS SIGN}", "-")
-    units = Counter(_UNIT_BEHIND.findall(text)).most_common(1)
-    if not units or units[0][1] < _FEWEST**2:
+    unit = max("CFK", key=text.count)
+    if text.count(unit) < _FEWEST**2 or _UNIT_BEHIND.findall(text).count(unit) < _FEWEST**2:
         return text.splitlines(), ""
-    return _UNIT_BEHIND.sub("", text).splitlines(), units[0][0]
+    return _UNIT_BEHIND.sub("", text).splitlines(), unit
 
 
 def _blocks(lines: list[str], delimiter: str) -> list[_Block]:
@@ -780,7 +780,9 @@ def _blocks(lines: list[str], delimiter: str) -> list[_Block]:
         elif row is not None:
             blocks.append((number, [row]))
         width = len(row or ())
-    return [_Block(first, np.array(rows)) for first, rows in blocks]
+    # No frame has so few lines; of a log every line may be a block.
+    low = all(len(rows) < _FEWEST for _, rows in blocks)
+    return [] if low else [_Block(first, np.array(rows)) for first, rows in blocks]
 
 
 def _parted(block: _Block, lines: list[str], delimiter: str) -> list[_Block]:

@@ -13,6 +13,7 @@ import pytest
 import tifffile
 import xarray as xr
 
+from tests.thermography.flir_mutations import sequence
 from tests.thermography.plan_scene import SC660
 from thermography.common import ThermographyError
 from thermography.io import flir
@@ -660,3 +661,10 @@ def test_numbers_of_rows_and_columns_are_no_pixels(tmp_path, written):
     path.write_text("\n".join(lines) + "\n")
     np.testing.assert_array_equal(TextReader().read_values(path, 0, StackOptions()), frame)
     assert TextReader().contents(path, StackOptions()).shape == (24, 32)
+
+
+def test_bytes_before_the_first_frame_of_a_sequence_do_not_hide_it(tmp_path):
+    sequence(tmp_path / "a.seq", frames=3)
+    (tmp_path / "a.seq").write_bytes(b"\x07" * 100 + (tmp_path / "a.seq").read_bytes())
+    frames, (rejected,) = index_recordings([tmp_path / "a.seq"])
+    assert [frame.index for frame in frames] == [1, 2, 3] and "expected a JPEG" in rejected.reason
