@@ -194,6 +194,12 @@ def fit_fixed_effects(system: DriftSystem, response: Array, design: Design) -> D
     return _solve(system, _Problem.of(response, design))
 
 
+def log_likelihoods(fit: DriftFit, ratios: Array) -> Array:
+    """Restricted log-likelihoods (k,) of the same readings and fixed effects under other variance ratios (k, components)."""
+    problem = _Problem.of(fit.response, fit.design)
+    return np.array([_solve(replace(fit.system, ratios=tried), problem).log_likelihood for tried in ratios])
+
+
 #: Columns of a design; those of very many sites are held by the readings that have them.
 Design: TypeAlias = "Array | sparse.csr_array"
 

@@ -21,6 +21,7 @@ from interferometry.drift.gls import (
     DriftFit,
     estimate,
     fit_fixed_effects,
+    log_likelihoods,
     memory_of_each,
 )
 from interferometry.drift.kalman import DriftModelError, DriftSystem, Order
@@ -66,12 +67,7 @@ def plausible_ratios(fit: DriftFit, rng: np.random.Generator, *, draws: int) -> 
     components = centre.size
     exponents = np.stack(np.meshgrid(*[_PLAUSIBLE] * components, indexing="ij"), axis=-1).reshape(-1, components)
     tried = centre * 10.0**exponents
-    likelihood = np.array(
-        [
-            fit_fixed_effects(replace(fit.system, ratios=ratios), fit.response, fit.design).log_likelihood
-            for ratios in tried
-        ]
-    )
+    likelihood = log_likelihoods(fit, tried)
     weight = np.exp(likelihood - likelihood.max())
     return tried[rng.choice(weight.size, size=draws, p=weight / weight.sum())]
 
