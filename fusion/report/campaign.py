@@ -481,7 +481,7 @@ def steps_table(loop: Loop) -> Table:
 
 
 def _step_cells(step: StepPart, held_out: str) -> list[str]:
-    text = parameters(step.parameters, step.parameter_ranges)
+    text = ", ".join(part for part in (say("height", step), parameters(step.parameters, step.parameter_ranges)) if part)
     return [
         f"{say('names', step)}{f': {text}' if text else ''}{f'; without a name: {step.withheld}' if step.withheld else ''}",
         p_cell(step.p_value),

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-from fusion.results.parts import Number, PValue, ResultPart, Sensitivity
+from fusion.results.parts import Number, PValue, Quantity, ResultPart, Sensitivity
 
 Verdict = Literal["complete", "explained", "partial", "unexplained", "no_skill"]
 #: What readings that an effect was not fitted to say of it; "no": they contradict it.
@@ -149,7 +149,8 @@ class StepPart(ResultPart):
     tied: tuple[str, ...]
     """Effects that these data cannot distinguish from it: together with it they are one answer, "one of these"."""
     lowers_error: bool = True
-    """Whether readings that it was not fitted to, the hold-out or for an event blocks that are left out, are predicted better with it."""
+    """Whether readings that it was not fitted to, the hold-out or for an event blocks that are left out, are predicted better with it, by
+    more than chance (2 %), and it did not leave the forecast."""
     withheld: str = ""
     """Why its name is not given although the readings follow its columns; empty where it is."""
     runner_up: RunnerUp | Nothing
@@ -205,7 +206,15 @@ class RecordStep(StepPart):
     rejected: Mapping[str, str]
     """Effects of the same round that were rejected, with the reason."""
     event_s: Number
-    """Instant of an event, s from the start; null for an effect that is no event."""
+    """Instant at which an event began, s from the start, by the raw readings; null for an effect that is no event. How long it took, and
+    the ranges of both, are among the parameters."""
+    sizes_um: Mapping[str, Quantity] = {}
+    """Size of an event in every channel that takes part, um; empty for an effect that is no event, and in results of earlier versions."""
+
+    @property
+    def largest_sizes(self) -> list[tuple[str, Quantity]]:
+        """These sizes by channel, the largest first."""
+        return sorted(self.sizes_um.items(), key=lambda one: -abs(one[1].value or 0.0))
 
 
 class DriftShare(ResultPart):
@@ -642,3 +651,8 @@ class RecordLoop(Loop):
     """Sensors and displacements that are faulty or suspected, examined before any model."""
     runs: tuple[RunPart, ...] = ()
     """Runs of a record of several; absent where there is one."""
+
+    @property
+    def named(self) -> tuple[StepPart, ...]:
+        """The added effects that keep their name, that which moves the channels most first."""
+        return tuple(sorted(super().named, key=lambda one: -(one.rms_um or 0.0)))

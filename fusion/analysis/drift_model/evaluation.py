@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,8 @@ from interferometry.drift.kalman import DriftModelError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+StepT = TypeVar("StepT", bound=schema.StepPart)
 
 # What readings that an effect was not fitted to say of it: regression of these readings on its predicted share.
 
@@ -362,7 +364,7 @@ def describe_step(
         "cross_rmse_after_um": cross_um[1],
         "rms_um": rms_um,
         "tied": tied,
-        "lowers_error": unseen_um[1] < unseen_um[0],
+        "lowers_error": unseen_um[1] * schema.ERROR_BY_CHANCE < unseen_um[0],
         "withheld": withheld,
         "runner_up": runner_up,
         **answer.described(),
@@ -385,6 +387,14 @@ def left_out_of_forecast(problem: Problem[M], state: LoopState[M], unsupported: 
     while left != set(steps) and problem.hold_out_error(state.kept(left)) > schema.ERROR_BY_CHANCE * state.errors_um[0]:
         left.add(min(set(steps) - left, key=lambda place: problem.hold_out_error(state.kept(left | {place}))))
     return left
+
+
+def named_in_forecast(steps: Sequence[StepT], away: Collection[int]) -> list[StepT]:
+    """The steps, of which one that left the forecast keeps its name only where unseen readings bear it out."""
+    return [
+        step.model_copy(update={"lowers_error": False}) if place in away and step.borne_out != "yes" else step
+        for place, step in enumerate(steps)
+    ]
 
 
 def exceeds_noise(error_um: float, noise_um: float, share: float) -> bool:

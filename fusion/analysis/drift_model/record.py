@@ -41,6 +41,7 @@ from fusion.analysis.drift_model.evaluation import (
     exceeds_noise,
     leading_pattern,
     left_out_of_forecast,
+    named_in_forecast,
     unsupported_places,
     withheld_for,
 )
@@ -68,6 +69,7 @@ from fusion.analysis.drift_model.predictions import (
     track_record,
 )
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, RecordError, independent, reduce_record
+from fusion.analysis.drift_model.record_events import Event, find_events, laid_on_blocks
 from fusion.analysis.drift_model.recursion import FOLLOWED, Anchored, forecast
 from fusion.analysis.drift_model.search import (
     BUILT_IN,
@@ -91,7 +93,7 @@ from fusion.analysis.drift_model.search import (
     withdraw,
 )
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
-from fusion.analysis.effects.events import periods_min
+from fusion.analysis.effects.events import STEP_EVENT, periods_min
 from fusion.analysis.effects.library import library
 from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
 from fusion.analysis.levels import RECORD_ENTRY_LEVEL, REMAINDER_LEVEL
@@ -177,7 +179,7 @@ class RecordFit:
     ----------
     record, used : the record, and the blocks (blocks,) that the fit was made from
     terms : the effects, declared ones first; each with columns for all blocks, shared by the channels
-    channels : the generalised least-squares fit of every channel under its own drift
+    channels : without the events, the generalised least-squares fit of every channel under its own drift
     rows : the blocks of each channel's fit, as indices
     """
 
@@ -203,16 +205,30 @@ def columns_of(record: Record, terms: Sequence[Term]) -> Array:
     return np.concatenate([np.empty((record.seconds.size, 0)), *(term.candidate.columns for term in terms)], axis=1)
 
 
+def events_of(record: Record, terms: Sequence[Term]) -> Array:
+    """What the events among some terms are in every block and channel, um."""
+    events = [term.candidate for term in terms if isinstance(term.candidate, Event)]
+    return np.sum([np.zeros(record.displacement.shape), *(one.columns * one.size for one in events)], axis=0)
+
+
+def without_events(record: Record, terms: Sequence[Term]) -> Record:
+    """The record without the events among some terms."""
+    return replace(record, displacement=record.displacement - events_of(record, terms))
+
+
 def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -> RecordFit:
-    """Fit every channel by itself: a constant for every run, terms, and a drift whose order and size come from restricted likelihood."""
-    most = int(used.sum()) // _PER_COLUMN
-    parts = [_leading(np.asarray(term.candidate.columns), used, most) for term in terms]
+    """Fit every channel by itself, without the events: a constant for every run, the other terms, and a drift whose order and size come
+    from restricted likelihood.
+    """
+    most, left = int(used.sum()) // _PER_COLUMN, without_events(record, terms).displacement
+    fitted = [term for term in terms if not isinstance(term.candidate, Event)]
+    parts = [_leading(np.asarray(term.candidate.columns), used, most) for term in fitted]
     columns = np.concatenate([columns_of(record, []), *parts], axis=1)
     columns = columns[:, independent(columns[used])]
     rng = np.random.default_rng(0)
     fits, rows = [], []
     for k, name in enumerate(record.channels):
-        response = record.displacement[:, k]
+        response = left[:, k]
         here = np.flatnonzero(used & np.isfinite(response))
         design = _with_levels(record, columns, here)
         if here.size < _LEAST_PER_COEFFICIENT * design.shape[1]:
@@ -331,12 +347,6 @@ MEAN = "mean of all"
 SOURCE_CHAIN = (0.0, 0.25, 1.0, 4.0)
 #: Time constants of the middle part, min.
 _SOURCE_MIN = (5.0, 10.0, 20.0, 40.0, 80.0)
-#: An event needs this share of the record on either side to be told from a drift.
-_EVENT_MARGIN = 0.05
-#: Instants at which an event is tried.
-_EVENT_INSTANTS = 200
-#: Shares of a block that a closer look tries as the part of it that lies after an event; coarser, and one event needs two steps.
-_SHARES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 #: Fewer periods than this are no rhythm: any slow drift looks like them.
 _LEAST_PERIODS = 6.0
 
@@ -374,29 +384,6 @@ def _unseen_heat_source(record: Record, near: Candidate | None) -> Iterator[Cand
             yield Candidate(np.column_stack(states), parameters, ("um",) * len(states))
 
 
-def _step_event(record: Record, near: Candidate | None) -> Iterator[Candidate]:
-    """A level shift at one instant, in every channel by its own amount."""
-    first, last = record.seconds[0], record.seconds[-1]
-    margin = _EVENT_MARGIN * (last - first)
-    if near is None or near.event_s is None:
-        every = max(1, record.seconds.size // _EVENT_INSTANTS)
-        instants = record.seconds[::every]
-    else:
-        instants = record.seconds[np.abs(record.seconds - near.event_s) <= 0.01 * (last - first)]
-    for instant in instants:
-        if not first + margin <= instant <= last - margin:
-            continue
-        for share in (0.0,) if near is None else _SHARES:
-            late = (record.seconds >= instant).astype(float)
-            place = int(np.argmax(late))
-            # The first block of a run has none before it that the event could lie in.
-            before = share if record.run[place - 1] == record.run[place] else 0.0
-            late[place - 1] = before
-            # The instant is the middle of the first block that lies after the event as a whole.
-            time_s = float(instant - (0.5 + before) * record.block_s)
-            yield Candidate(late[:, None], {"time_s": time_s}, ("um",), float(instant))
-
-
 def _happened_s(candidate: Candidate) -> float | None:
     """When an event happened, s since the start; None for an effect that lasts."""
     return None if candidate.event_s is None else float(candidate.parameters.get("time_s", candidate.event_s))
@@ -428,7 +415,6 @@ def _around(near: Candidate | None, grid: tuple[float, ...]) -> tuple[float, ...
 _CANDIDATES = {
     "thermal_lag": _thermal_lag,
     "unseen_heat_source": _unseen_heat_source,
-    "step_event": _step_event,
     "periodic_disturbance": _periodic_disturbance,
 }
 
@@ -456,10 +442,12 @@ def needs_of(effect: Effect, record: Record) -> str | None:
 def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, Effect], dict[str, str]]:
     """Effects that can act in a record, and why the others of the library are not tried."""
     offered = library() if effects is None else effects
-    not_tried = {name: "a record has no positions" for name in offered if name in BUILT_IN - _CANDIDATES.keys()}
+    # Events are found before the search, in the raw readings.
+    left = BUILT_IN - _CANDIDATES.keys() - {STEP_EVENT.name}
+    not_tried = {name: "a record has no positions" for name in offered if name in left}
     # A sensor that jumps is left out before.
     not_tried |= {name: "the sensors are examined before the search" for name in not_tried if name == "sensor_fault"}
-    return {name: effect for name, effect in offered.items() if name not in not_tried}, not_tried
+    return {name: effect for name, effect in offered.items() if name not in {*not_tried, STEP_EVENT.name}}, not_tried
 
 
 # Grounds of a record: excitation by its drivers, noise of its sensors, and the course of a delayed sensor.
@@ -469,20 +457,11 @@ _ONE_SWITCHING = 0.99
 
 
 class RecordGrounds:
-    """Grounds of a record: the record and a model of it without the candidate.
+    """Grounds of a record: the record and a model of it without the candidate."""
 
-    Parameters
-    ----------
-    model : RecordFit
-        Without the candidate.
-    least_gain : float
-        Log-likelihood that an event has to gain beside a shift at a switching, or it only stands in for that one.
-    """
-
-    def __init__(self, model: RecordFit, *, least_gain: float = 0.0) -> None:
+    def __init__(self, model: RecordFit) -> None:
         self._model = model
         self._record = model.record
-        self._least_gain = least_gain
 
     def is_admissible(self, candidate: Candidate) -> bool:
         """Whether nothing speaks against a candidate before any fit: it is no event at a switching, and no lag of a noisy sensor."""
@@ -497,29 +476,10 @@ class RecordGrounds:
         return bool(self._record.switched()[np.searchsorted(self._record.seconds, event_s)])
 
     def at_switching(self, candidate: Candidate) -> float | None:
-        """Hours since the start of the switching at which an event happened, or whose response it stands in for."""
+        """Hours since the start of the switching at which an event happened."""
         if candidate.event_s is None:
             return None
-        if self._is_switched(candidate.event_s):
-            return float(_happened_s(candidate) or 0.0) / 3600.0
-        if self._least_gain <= 0.0:
-            return None
-        record = self._record
-        shifts = [
-            Candidate(
-                (record.seconds >= instant).astype(float)[:, None],
-                {"time_s": float(instant - 0.5 * record.block_s)},
-                ("um",),
-                float(instant),
-            )
-            for instant in record.seconds[record.switched() & self._model.used]
-        ]
-        if not shifts:
-            return None
-        rival = shifts[int(np.argmax(channel_gains(self._model, shifts).gain[:, 0]))]
-        both = replace(candidate, columns=np.column_stack([candidate.columns, rival.columns]), beside=1)
-        gain = float(channel_gains(self._model, [both]).gain[0, 0])
-        return None if gain >= self._least_gain else float(_happened_s(rival) or 0.0) / 3600.0
+        return float(_happened_s(candidate) or 0.0) / 3600.0 if self._is_switched(candidate.event_s) else None
 
     def heat_is_logged(self) -> bool:
         """Whether a driver was logged."""
@@ -622,13 +582,38 @@ class RecordProblem(Problem[RecordFit]):
     ) -> None:
         self.record, self.train, self.rng = record, train, rng
         self.effects, self._not_tried = record_library(effects)
+        self.finds_events = effects is None or STEP_EVENT.name in effects
 
     def start(self, declared: Sequence[Term]) -> RecordState:
-        """The state before the search: the declared model, and the effects that this record cannot show."""
+        """The state before the search: the declared model with the events of the raw readings, and the effects that this record cannot
+        show.
+        """
         missing = {name: needs_of(effect, self.record) for name, effect in self.effects.items()}
-        return RecordState(fit_record(self.record, declared, self.train)).without_effects(
+        state = RecordState(fit_record(self.record, declared, self.train)).without_effects(
             {**self._not_tried, **missing}
         )
+        return self._with_events(state) if self.finds_events else state
+
+    def _with_events(self, state: RecordState) -> RecordState:
+        """The state with the events of the training part, those that explain most first."""
+        samples, error_um = self.record.readings, self.predict(state.model.terms).chained_rmse
+        used, switched = (each[samples.block] for each in (self.train, self.record.switched()))
+        found, decisions = find_events(samples, used, self.record.displacement_step, switched)
+        scores = []
+        for event in (laid_on_blocks(one, samples, self.train.size) for one in found):
+            gain = float(channel_gains(state.model, [event]).gain[0, 0])
+            after_um = self.predict([*state.declared, Term(STEP_EVENT.name, event)]).chained_rmse
+            ranges = {"time_s": event.onset.ends(), "duration_min": event.duration.ends(60.0)}
+            confirmed = Confirmation(True, Confirmed.RAW_READINGS, error_um=after_um)
+            p = event.p_value
+            scores.append(Score(STEP_EVENT.name, event, gain, gain, p, p, confirmation=confirmed, ranges=ranges))
+        if not scores:
+            return state.decide(*decisions)
+        state = state.scored(Round(tuple(scores), tuple(decisions), error_um))
+        for score in scores:
+            model = self.refit(state.model, [*state.model.terms, Term(score.name, score.best)])
+            state = state.entered(model, score, Confirmed.RAW_READINGS)
+        return state
 
     def refit(self, model: RecordFit, terms: Sequence[Term]) -> RecordFit:
         """Fit other terms to the blocks that a model was fitted to."""
@@ -660,7 +645,7 @@ class RecordProblem(Problem[RecordFit]):
                 score.name, Reason.WITHIN_DIGITS, {"range_um": float(moved[largest]), "step_um": float(step[largest])}
             )
         excited_by = self.effects[score.name].excited_by if score.name in BUILT_IN else ""
-        return refuse(score.name, excited_by, score.best, RecordGrounds(model, least_gain=score.critical))
+        return refuse(score.name, excited_by, score.best, RecordGrounds(model))
 
     def confirm(self, score: Score, state: RecordState) -> Score:
         """Look at the effect more closely, and predict the later parts of the training time with it."""
@@ -686,8 +671,26 @@ class RecordProblem(Problem[RecordFit]):
         return (self.record.displacement - self.predict(terms).predicted)[~self.train]
 
     def predict(self, terms: Sequence[Term]) -> Prediction:
-        """Predict all blocks from the training part."""
-        return predict(self.record, columns_of(self.record, terms), self.train)
+        """Predict all blocks from the training part; events have their own size."""
+        fitted = [term for term in terms if not isinstance(term.candidate, Event)]
+        told = predict(without_events(self.record, terms), columns_of(self.record, fitted), self.train)
+        coefficients = [
+            term.candidate.size[None]
+            if isinstance(term.candidate, Event)
+            else told.coefficients[place_of(fitted, term)]
+            for term in terms
+        ]
+        return replace(
+            told,
+            predicted=told.predicted + events_of(self.record, terms),
+            coefficients=np.concatenate([told.coefficients[:0], *coefficients]),
+        )
+
+    def predict_left_out(self, terms: Sequence[Term]) -> Array:
+        """Predict every part of the record from all others, by the penalty of the training part."""
+        fitted = [term for term in terms if not isinstance(term.candidate, Event)]
+        columns, left = columns_of(self.record, fitted), without_events(self.record, terms)
+        return predict_left_out(left, columns, self.predict(terms).penalty) + events_of(self.record, terms)
 
     def offer(self, name: str, model: RecordFit, near: Candidate | None) -> list[Candidate]:
         """Candidates of an effect that vary over the training part."""
@@ -1052,6 +1055,7 @@ def report_steps(
             chained_rmse_after_um=step.score.error_um,
             rejected=_rejected(step.round),
             event_s=_happened_s(term.candidate),
+            sizes_um=term.candidate.sizes(record.channels) if isinstance(term.candidate, Event) else {},
         )
         for place, (step, term, squares) in enumerate(
             zip(state.steps, state.added, [series**2 for series in contributed], strict=True)
@@ -1103,9 +1107,8 @@ def close_record(
     whole = fit_record(record, state.model.terms, np.ones_like(train))
     model = problem.predict(state.model.terms)
     left_out = [
-        # The penalty is that from the training part.
-        predict_left_out(record, columns_of(record, terms), problem.predict(terms).penalty)
-        for terms in (state.model.terms, *(state.kept([place]) for place in range(len(state.steps))))
+        problem.predict_left_out(kept)
+        for kept in (state.model.terms, *(state.kept([place]) for place in range(len(state.steps))))
     ]
     series = series_of(state.model.terms, model)
     told = ask_unseen(record, ~train, state, series, left_out)
@@ -1151,7 +1154,7 @@ def close_record(
         },
         skill_um=rmse(errors["final"]),
         tracking=None if record.runs else track_record(record, train, of_final.predicted, predicted["ridge"]),
-        steps=steps,
+        steps=named_in_forecast(steps, away),
         away=frozenset(away),
         remainder=examine(whole, channel_rmse(errors["final"]), step, np.random.default_rng(seed)),
         wandering_um=drift_um,
@@ -1189,7 +1192,8 @@ def ask_unseen(
 ) -> list[Answer]:
     """What blocks that the coefficients were not fitted to say of every added effect: the hold-out set; of an event parts left out.
 
-    ``share`` is what every term of the final model contributes. An event before the hold-out set is a constant there.
+    ``share`` is what every term of the final model contributes. An event before the hold-out set is a constant there: the raw readings
+    around it were asked.
     """
     declared = np.sum([np.zeros(record.displacement.shape), *share[: len(state.declared)]], axis=0)
     added = share[len(state.declared) :]
@@ -1202,6 +1206,9 @@ def ask_unseen(
     told = dict(zip(lasting, asked, strict=True))
     everywhere = np.ones_like(held_out)
     for place in events:
+        if isinstance(event := state.added[place].candidate, Event):
+            told[place] = replace(event.answer, level=event.answer.level / len(added))
+            continue
         without = left_out[1 + place]
         parts = _unseen(record, everywhere, record.displacement - without, [], [left_out[0] - without])
         (told[place],) = answers(parts, family=len(added))

@@ -7,7 +7,7 @@ time constant; drivers are averaged after they are raised to a power, because he
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -77,6 +77,27 @@ class RecordedRun:
 
 
 @dataclass(frozen=True)
+class Samples:
+    """Raw samples of a record, on its axis of time.
+
+    Attributes
+    ----------
+    seconds : (samples,) s
+    block, run : (samples,) number of the block and of the run that holds each
+    displacement : (samples, channels) um; NaN where there is none
+    moved : (samples, sensors and drivers) degC and share of the driver's largest size
+    names : of sensors and drivers
+    """
+
+    seconds: Array
+    block: NDArray[np.intp]
+    run: NDArray[np.intp]
+    displacement: Array
+    moved: Array
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Record:
     """A record on its blocks. Runs follow each other on one axis of time, with a border of one block between them.
 
@@ -101,6 +122,7 @@ class Record:
     first : number of the first block of every run
     driver_sizes : driver to its largest size and the unit of that
     constant_drivers : loads that are left out because they never change, as "name (value unit)"
+    samples : the raw samples; None of a record that is given as blocks
     """
 
     start: np.datetime64
@@ -124,6 +146,16 @@ class Record:
     first: tuple[int, ...] = (0,)
     driver_sizes: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     constant_drivers: tuple[str, ...] = ()
+    samples: Samples | None = None
+
+    @property
+    def readings(self) -> Samples:
+        """The raw samples, or the blocks where no others are known."""
+        if self.samples is not None:
+            return self.samples
+        moved = np.column_stack([self.temperature, *(powers[1] for powers in self.drivers.values())])
+        block = np.arange(self.seconds.size)
+        return Samples(self.seconds, block, self.run, self.displacement, moved, (*self.sensors, *self.drivers))
 
     @property
     def rise(self) -> Array:
@@ -227,6 +259,24 @@ class _Blocks:
                 )
             filled.append(np.interp(seconds, seconds[known], values[known]))
         return np.concatenate(filled)
+
+    def samples(self, table: xr.Dataset, elapsed: Array, kept: Mapping[str, Sequence[str]]) -> Samples:
+        """The samples of a table at times since its first, s, with the columns that are kept by variable."""
+        run = np.searchsorted(self.first, self.place, side="right") - 1
+        zero = np.array([elapsed[run == k].min() for k in range(len(self.first))])
+        values = {
+            name: table[name].sel({_POSSIBLE[name][0]: list(columns)}).values.astype(float)
+            for name, columns in kept.items()
+        }
+        loads = values["driver"] / np.maximum(np.nanmax(np.abs(values["driver"]), axis=0, initial=0.0), 1e-300)
+        return Samples(
+            elapsed - zero[run] + np.array(self.zero_s)[run],
+            self.place,
+            run,
+            values["displacement"],
+            np.column_stack([values["temperature"], loads]),
+            (*kept["temperature"], *kept["driver"]),
+        )
 
     def rows(self) -> list[slice]:
         """Blocks of every run."""
@@ -335,6 +385,11 @@ def reduce_record(table: xr.Dataset, *, constants: Collection[str] = ()) -> Reco
         first=blocks.first,
         driver_sizes=driver_sizes,
         constant_drivers=constant_drivers,
+        samples=blocks.samples(
+            table,
+            elapsed,
+            {"displacement": channels, "temperature": [sensors[k] for k in kept], "driver": list(drivers)},
+        ),
     )
 
 

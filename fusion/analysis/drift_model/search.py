@@ -44,6 +44,7 @@ class Reason(StrEnum):
     SINGLE_WARM_UP = "single warm-up"
     SINGLE_SWITCHING = "single switching"
     AT_SWITCHING = "at a switching"
+    WITH_A_LOAD = "with a load"
     HETEROSCEDASTIC_DRIFT = "heteroscedastic drift"
     TEMPERATURE_NOISE = "temperature noise"
     FOLLOWS_RATE = "follows the rate"
@@ -181,6 +182,7 @@ class Confirmed(StrEnum):
     OTHER_TARGETS = "confirmed on the other half of the targets, coefficients frozen"
     BY_EVIDENCE = "confirmed by the evidence of all training cycles; their later blocks alone do not decide"
     SECOND_SEARCH = "found in all cycles after the hold-out set was opened: it has no held-out error"
+    RAW_READINGS = "out of proportion to all other changes of the raw readings, and confirmed in every other reading"
     LATER_PARTS = "confirmed on later parts of the training time, each predicted from those before it"
 
 
@@ -537,7 +539,7 @@ def search(problem: Problem[M], state: LoopState[M], *, progress: Progress = no_
         before, state = state, settled(problem, state, enter(problem, state, score))
         if state is before:
             return state
-        if state.events > MOST_EVENTS:
+        if score.name == "step_event" and state.events > MOST_EVENTS:
             events = [place for place, step in enumerate(state.steps) if step.effect == "step_event"]
             evidence = {"most": MOST_EVENTS, "search_p": state.steps[-1].score.family_wise_p}
             return withdraw(problem, state, events, [Decision("step_event", Reason.TOO_MANY_EVENTS, evidence)])

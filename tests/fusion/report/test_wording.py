@@ -369,7 +369,7 @@ def test_a_record_repeats_values_and_predicts_blocks_of_time():
         name: ChannelErrors.model_construct(rmse_declared_um=3.01, rmse_final_um=after)
         for name, after in (("ch1", 2.0), ("ch2", 3.21))
     }
-    lagging = loop("explained", step("thermal_lag"), held_out="37.0 h to 46.3 h held out; x")
+    lagging = loop("explained", step("thermal_lag", rms_um=0.4), held_out="37.0 h to 46.3 h held out; x")
     told = {**vars(lagging), "channels": channels}
     stated = say("how_sure", results(RecordLoop.model_construct(**told)))
     parts = (
@@ -582,6 +582,16 @@ def test_an_event_is_told_with_its_size_and_its_local_time():
         effect="step_event", parameters={}, parameter_ranges={}, event_s=7200.0, event_time=None
     )
     assert say("when", late, None) == "2.0 h after the start"
+    slip = late.model_copy(
+        update={
+            "parameters": {"course": "even", "duration_min": 900.0}, "parameter_ranges": {"time_s": (3600.0, 10800.0)},
+            "sizes_um": {"crack 2": Quantity(value=4.0, u=1.0), "crack 3": Quantity(value=-333.0, u=2.0)}, "confirmed": True,
+            "tied": (), "borne_out": "yes",
+        }
+    )  # fmt: skip
+    told = "a slip (−333.0 ± 4.0 µm in crack 3, 4.0 ± 2.0 µm in crack 2, at 2.0 h after the start (60 min to 3.0 h), within 15.0 h)"
+    assert step_phrase(slip, None, record=True).replace("-", "−") == told
+    assert told in say("verdict", loop("no_skill", slip), None, True).replace("-", "−")
     scale = axis_step("step_event", event_cycle=38, parameters={"shape": "linear"})
     assert step_phrase(scale, None, record=False).startswith("a sudden change in proportion to the position (2.10")
     assert "was a mirror realigned" in action(scale, None, record=False)

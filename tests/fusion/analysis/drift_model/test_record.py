@@ -203,19 +203,15 @@ def test_the_library_is_scored_and_what_is_in_the_model_is_not_tried_again():
     problem = problem_of(record)
     declared = declare(["quasi_static"], record)
     scored = problem.score(problem.start(declared))
-    assert {one.name for one in scored.scores} == {
-        "thermal_lag",
-        "unseen_heat_source",
-        "step_event",
-        "periodic_disturbance",
-    }
+    # Events are found before the search.
+    assert {one.name for one in scored.scores} == {"thermal_lag", "unseen_heat_source", "periodic_disturbance"}
     assert scored.scores[0].name == "periodic_disturbance" and scored.scores[0].family_wise_p < 0.01
     assert scored.start_error_um == problem.predict(declared).chained_rmse
     lag = Term("thermal_lag", score("thermal_lag").best)
     rhythm = Term("periodic_disturbance", score().best)
     families, _ = problem.families(problem.start([*declared, lag, rhythm]), BLOCKS)
     # A rhythm may come twice, a lag once.
-    assert set(families) == {"unseen_heat_source", "step_event", "periodic_disturbance"}
+    assert set(families) == {"unseen_heat_source", "periodic_disturbance"}
 
 
 def test_candidates_that_never_move_in_training_are_not_offered():
@@ -360,48 +356,6 @@ def test_a_source_heats_a_chain_of_parts_in_proportion_to_load_and_its_square():
     assert len(closer) == 7 and candidates("unseen_heat_source", of, near(follows="load", time_constant_min=20.0)) == []
 
 
-def test_an_event_needs_a_twentieth_of_the_record_on_either_side():
-    of = record()
-    events = candidates("step_event", of)
-    span = of.seconds[-1] - of.seconds[0]
-    inner = of.seconds[(of.seconds - of.seconds[0] >= 0.05 * span) & (of.seconds[-1] - of.seconds >= 0.05 * span)]
-    np.testing.assert_array_equal([c.event_s for c in events], inner)
-    for candidate in events[::40]:
-        np.testing.assert_array_equal(candidate.columns[:, 0], np.where(of.seconds < candidate.event_s, 0.0, 1.0))
-        assert candidate.parameters == {"time_s": candidate.event_s - 0.5 * of.block_s}
-
-
-def test_a_long_record_tries_every_second_block_and_a_closer_look_all():
-    of = record_of(np.zeros((400, 1)), np.zeros((400, 1)))
-    events = candidates("step_event", of)
-    np.testing.assert_allclose(np.diff([c.event_s for c in events]), 600.0)
-    instant = float(of.seconds[200])
-    closer = candidates("step_event", of, near(instant, time_s=instant))
-    # A hundredth of 399 blocks on either side, and eight instants within each.
-    np.testing.assert_array_equal([c.event_s for c in closer], np.repeat(of.seconds[197:204], 8))
-    within = closer[26]
-    assert within.parameters == {"time_s": of.seconds[200] - 0.75 * of.block_s}
-    np.testing.assert_array_equal(within.columns[198:202, 0], [0.0, 0.25, 1.0, 1.0])
-
-
-@pytest.mark.parametrize("share", [0.0, 0.125, 0.5, 0.875])
-@pytest.mark.parametrize("samples_per_block", [1, 8])
-def test_an_event_has_the_time_at_which_it_happened(share, samples_per_block):
-    """A step within a block whose mean it moves by the share of the samples after it; the best candidate has the very columns."""
-    step_s, block = 60.0, 120
-    displacement = np.zeros((240 * samples_per_block, 1))
-    first = block * samples_per_block - round(share * samples_per_block)
-    displacement[first:] = 5.0
-    places = np.arange(240 * samples_per_block) // samples_per_block
-    means = np.bincount(places, displacement[:, 0])[:, None] / samples_per_block
-    of = record_of(means, np.zeros((240, 1)), block_s=samples_per_block * step_s)
-    # Of the samples' own times, whose mean is that of the block.
-    truth_s = of.seconds[0] + step_s * (first - 0.5 * samples_per_block)
-    closer = candidates("step_event", of, near(float(of.seconds[block]), time_s=0.0))
-    best = min(closer, key=lambda one: float(np.abs(5.0 * one.columns - means).max()))
-    assert best.parameters["time_s"] == pytest.approx(truth_s)
-
-
 def test_a_rhythm_has_six_periods_and_four_blocks_in_each():
     of = record()
     waves = candidates("periodic_disturbance", of)
@@ -462,32 +416,10 @@ def test_an_event_within_two_blocks_of_a_switching_belongs_to_it():
     assert grounds.at_switching(Candidate(np.zeros((MANY, 1)), {}, ("um",))) is None
 
 
-def stepped(at: int, *, beside: int | None = None) -> tuple[RecordFit, Candidate]:
-    """A record whose load is switched once in the middle, with a step at one block and perhaps at another, and the first as an event."""
-    rng = np.random.default_rng(8)
-    level = np.where(np.arange(MANY) < 120, 0.0, 1.0)
-    steps = sum((3.0 * (np.arange(MANY) >= block) for block in (at, beside) if block is not None), np.zeros(MANY))
-    displacement = steps[:, None] + 0.1 * rng.standard_normal((MANY, 2))
-    record = record_of(displacement, 20.0 + rng.normal(0.0, 0.01, (MANY, 1)), drivers={"speed": level})
-    event = Candidate((np.arange(MANY) >= at).astype(float)[:, None], {}, ("um",), float(record.seconds[at]))
-    return fit_record(record, [], np.ones(MANY, bool)), event
-
-
-def test_an_event_beside_a_switching_must_not_stand_in_for_its_response():
-    """Three blocks after the switching an instant is admissible; a shift at the switching explains most of what it would."""
-    model, _ = stepped(120)
-    late = Candidate((np.arange(MANY) >= 123).astype(float)[:, None], {}, ("um",), float(model.record.seconds[123]))
-    grounds = RecordGrounds(model, least_gain=10.0)
-    assert grounds.is_admissible(late)
-    switched_s = float(model.record.seconds[120]) - 0.5 * model.record.block_s
-    assert grounds.at_switching(late) == pytest.approx(switched_s / 3600.0)
-    for at, beside in ((60, None), (60, 120)):
-        model, event = stepped(at, beside=beside)
-        assert RecordGrounds(model, least_gain=10.0).at_switching(event) is None
-
-
 def test_candidates_that_no_fit_could_save_are_not_admissible():
-    model, event = stepped(119)
+    displacement, temperature = np.random.default_rng(8).normal(0.0, 0.1, (2, MANY, 1))
+    record = record_of(displacement, temperature, drivers={"speed": np.where(np.arange(MANY) < 120, 0.0, 1.0)})
+    model, event = quiet(record), Candidate(np.zeros((MANY, 1)), {}, ("um",), float(record.seconds[119]))
     noisy = replace(model.record, temperature_noise=np.array([0.5]))
     grounds = RecordGrounds(replace(model, record=noisy))
     assert not grounds.is_admissible(event)

@@ -1,0 +1,620 @@
+"""Events of a record: slips, creeps and settlings, dated and sized in the raw readings of every channel before any mean is taken.
+
+The readings after an instant are compared with those before it, over windows of all lengths, beside what temperatures and loads do over
+the same windows. An event is a change that is out of proportion to all others of its channel: docs/method/records.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, optimize
+
+from fusion.analysis.alignment.first_order_lag import respond
+from fusion.analysis.drift_model.evaluation import Answer
+from fusion.analysis.drift_model.record_data import Samples
+from fusion.analysis.drift_model.search import Decision, Reason
+from fusion.analysis.effects.effect import Candidate
+from fusion.analysis.levels import RECORD_ENTRY_LEVEL
+from fusion.common import Array
+from fusion.results.parts import Quantity
+
+#: Cells of equal length that readings are laid into at most: a longer log has means of neighbours.
+_MOST_CELLS = 20_000
+#: Shortest window in cells, and the longest as a share of the record, which must hold many of them.
+_SHORTEST, _LONGEST_SHARE = 4, 1.0 / 24.0
+#: Time constants of the lagged copies of temperatures and loads, as shares of the record.
+_LAG_SHARES = (1.0 / 1000.0, 1.0 / 250.0, 1.0 / 60.0)
+#: Windows per column of the regression on these, rows that it is made from at most, and the excursion that counts in full (Huber).
+_PER_COLUMN, _ROWS, _HUBER = 8, 1500, 1.345
+#: The largest excursions say nothing of the others, as they may be events: their share and least number.
+_CENSORED_SHARE, _CENSORED = 0.1, 4
+#: A change belongs to a temperature or load that changes over the same window by so many robust standard deviations, and in no more than
+#: this share of all windows by as much.
+_UNUSUAL, _SELDOM = 4.0, 0.02
+#: Points of a closer look, and how long a change may take, as shares of it.
+_POINTS = 160
+_DURATIONS = (0.0, 0.02, 0.035, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45)
+#: Log-likelihood by which the best may beat what a 95 % interval still holds, and that a course of two parts must gain.
+_WITHIN, _SECOND_PART = 1.92, 3.0
+#: Standard uncertainties from which on a channel takes part in an event that another shows.
+_TAKES_PART = 4.0
+#: Standard uncertainties within which two looks give a change one size.
+_SAME_SIZE = 1.5
+#: An exponential approach has 95 % of its size after so many time constants.
+_TIME_CONSTANTS = 3.0
+#: Power of an excursion that is exponential far out: 2 of a normal distribution; less, as what machines do has longer tails.
+_TAIL = 1.5
+#: Fewest readings, and fewest points and degrees of freedom that tell anything, and iterations of a robust regression.
+_LEAST_READINGS, _LEAST_POINTS, _LEAST_FREEDOM, _ITERATIONS = 40, 8, 3, 5
+_EVERY_OTHER = "in every other reading around it"
+#: More events than this in one channel are a switching that nobody logged.
+MOST_OF_A_CHANNEL = 4
+
+
+class Interval(NamedTuple):
+    """A value and the 95 % interval that holds it."""
+
+    value: float
+    low: float
+    high: float
+
+    def ends(self, unit: float = 1.0) -> list[float | None]:
+        """The ends of the interval in a unit; None where the readings set none."""
+        return [end / unit if np.isfinite(end) else None for end in self[1:]]
+
+
+class Course(NamedTuple):
+    """Share of a change that has happened: a part at once, the rest evenly or settling until `duration_s` after the onset, s."""
+
+    onset_s: float
+    duration_s: float
+    settles: bool = False
+    at_once: float = 0.0
+
+    def at(self, seconds: Array) -> Array:
+        """Shares (n,) at times, s; NaN where no time is known."""
+        if not self.duration_s:
+            return np.asarray(np.where(np.isnan(seconds), np.nan, seconds >= self.onset_s))
+        later = (seconds - self.onset_s) / self.duration_s
+        if not self.settles:
+            return np.clip(later, 0.0, 1.0)
+        rest = (1.0 - self.at_once) * np.exp(-_TIME_CONSTANTS * np.maximum(later, 0.0))
+        return np.asarray(np.where(later < 0.0, 0.0, 1.0 - rest))
+
+    @property
+    def words(self) -> str:
+        """The course in words."""
+        if not self.duration_s:
+            return "at once"
+        return "at once, then settling" if self.at_once else "settling" if self.settles else "even"
+
+
+@dataclass(frozen=True)
+class Event(Candidate):
+    """A lasting change of some channels: a candidate with the size that the raw readings give it.
+
+    Attributes
+    ----------
+    course : its share of the change over time
+    onset, duration : s since the first reading, and s until 95 % of the change had happened
+    size, size_u : (channels,) um, zero in channels that take no part
+    p_value : probability of a change as large in any window of a record in which none happened
+    answer : what every other reading says of the size that the rest show
+    """
+
+    course: Course = field(kw_only=True)
+    onset: Interval = field(kw_only=True)
+    duration: Interval = field(kw_only=True)
+    size: Array = field(kw_only=True)
+    size_u: Array = field(kw_only=True)
+    p_value: float = field(kw_only=True)
+    answer: Answer = field(kw_only=True)
+
+    def sizes(self, channels: tuple[str, ...]) -> dict[str, Quantity]:
+        """Size in every channel that takes part, um."""
+        told = zip(channels, self.size.tolist(), self.size_u.tolist(), strict=True)
+        return {name: Quantity(value=value, u=u) for name, value, u in told if value}
+
+
+def laid_on_blocks(event: Event, samples: Samples, blocks: int) -> Event:
+    """The same event with its course as means over the blocks of a record (blocks, 1)."""
+    shares = event.course.at(samples.seconds)
+    number = np.bincount(samples.block, minlength=blocks)
+    return replace(
+        event, columns=(np.bincount(samples.block, shares, minlength=blocks) / np.maximum(number, 1))[:, None]
+    )
+
+
+class _Seen(NamedTuple):
+    """The change that is most out of proportion: its window begins at cell `at`, lasts `gap` cells between means of `mean` cells."""
+
+    log_p: float
+    at: int
+    gap: int
+    mean: int
+    channel: int
+
+
+def find_events(
+    samples: Samples, used: NDArray[np.bool_], digits: Array, switched: NDArray[np.bool_]
+) -> tuple[list[Event], list[Decision]]:
+    """Find the events in the used samples, those that explain most of a channel first, and what belongs to a load instead.
+
+    ``digits`` (channels,) um are the steps of the readings: what moves none by more is no event. ``switched`` (samples,) says where a
+    driver is switched.
+    """
+    cells, found, decisions = _Cells.of(samples, used), list[Event](), list[Decision]()
+    if cells is None:
+        return [], []
+    while (seen := cells.most_striking()) is not None:
+        if load := cells.load_that_changes(seen):
+            evidence: dict[str, float | str] = {"name": load, "hours": float(cells.seconds[seen.at]) / 3600.0}
+            decisions.append(Decision("step_event", Reason.WITH_A_LOAD, evidence))
+            cells.ignore(seen, slice(None))
+            continue
+        if (event := cells.closer(seen, digits)) is None:
+            cells.ignore(seen, seen.channel)
+            continue
+        if switched[(samples.seconds >= event.onset.low) & (samples.seconds <= event.onset.high)].any():
+            decisions.append(Decision("step_event", Reason.AT_SWITCHING, {"hours": event.onset.value / 3600.0}))
+            cells.ignore(seen, slice(None))
+            continue
+        found.append(event)
+        cells.take_out(event)
+        many = np.sum([one.size != 0.0 for one in found], axis=0) > MOST_OF_A_CHANNEL
+        if many.any():
+            evidence = {"most": MOST_OF_A_CHANNEL, "search_p": event.p_value}
+            decisions.append(Decision("step_event", Reason.TOO_MANY_EVENTS, evidence))
+            cells.leave_out(many)
+            found = [replace(one, size=np.where(many, 0.0, one.size)) for one in found if one.size[~many].any()]
+    if not found:
+        return [], decisions
+    left = cells.response - cells.moved @ cells.slopes[cells.windows()[-1]]
+    spread = np.nanvar(left[:, ~many], axis=0) + np.finfo(float).tiny
+    return sorted(found, key=lambda one: -float(np.max(one.size[~many] ** 2 / spread))), decisions
+
+
+@dataclass
+class _Cells:
+    """Readings on cells of equal length, NaN where there is none; runs lie apart.
+
+    Attributes
+    ----------
+    seconds : (cells,) time of each on the record's axis; between runs NaN
+    response : (cells, channels) um
+    moved : (cells, columns) temperatures and loads, K or share, then lagged copies of them
+    names : of the temperatures and loads
+    excursions, slopes : by gap and length of the means, in robust standard deviations of each channel, and of the columns in um per unit
+    changed : channels for which these have to be computed again
+    """
+
+    seconds: Array
+    step_s: float
+    response: Array
+    moved: Array
+    names: tuple[str, ...]
+    excursions: dict[tuple[int, int], Array] = field(default_factory=dict)
+    slopes: dict[tuple[int, int], Array] = field(default_factory=dict)
+    changed: dict[tuple[int, int], set[int]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, samples: Samples, used: NDArray[np.bool_]) -> _Cells | None:
+        """The used samples of a record; None where they are too few."""
+        runs = [
+            rows
+            for run in np.unique(samples.run[used])
+            if (rows := np.flatnonzero(used & (samples.run == run))).size > 2
+        ]
+        gaps = [np.diff(samples.seconds[rows]) for rows in runs]
+        if sum(one.size for one in gaps) < _LEAST_READINGS:
+            return None
+        span = sum(float(one.sum()) for one in gaps)
+        step = max(float(np.median(np.concatenate(gaps))), span / _MOST_CELLS)
+        apart = 2 + 3 * max(_SHORTEST, int(span / step * _LONGEST_SHARE))
+        parts = []
+        for rows in runs:
+            place = np.round((samples.seconds[rows] - samples.seconds[rows[0]]) / step).astype(int)
+            number = int(place[-1]) + 1
+            seconds = samples.seconds[rows[0]] + step * np.arange(number)
+            response, moved = (_means(values[rows], place, number) for values in (samples.displacement, samples.moved))
+            for column in moved.T:
+                known = np.isfinite(column)
+                column[:] = np.interp(seconds, seconds[known], column[known]) if known.any() else 0.0
+            late = [respond(moved, seconds, time_constant_s=share * span) for share in _LAG_SHARES]
+            laid = np.column_stack([seconds, response, moved, *late])
+            parts.append(np.pad(laid, ((0, apart), (0, 0)), constant_values=np.nan))
+        laid, channels = np.concatenate(parts), 1 + samples.displacement.shape[1]
+        return cls(laid[:, 0], step, laid[:, 1:channels], laid[:, channels:], samples.names)
+
+    def windows(self) -> list[tuple[int, int]]:
+        """Gaps and lengths of the means on either side, in cells: changes at once and changes that take as long as the window."""
+        longest = int(np.isfinite(self.seconds).sum() * _LONGEST_SHARE)
+        lengths = [_SHORTEST * 2**k for k in range(16) if _SHORTEST * 2**k <= max(longest, _SHORTEST)]
+        return [window for length in lengths for window in ((0, length), (length, max(3, length // 2)))]
+
+    def most_striking(self) -> _Seen | None:
+        """The change whose probability among all windows, lengths and channels is least, where it is small enough for an event."""
+        windows, channels = self.windows(), self.response.shape[1]
+        best: _Seen | None = None
+        for gap, mean in windows:
+            scaled = self.scaled(gap, mean)
+            together = [np.sqrt(np.mean(np.nan_to_num(scaled) ** 2, axis=1))] if channels > 1 else []
+            for number, values in enumerate([*scaled.T, *together]):
+                at, log_p = _log_p(np.abs(values), gap + mean)
+                log_p += np.log(len(windows) * (channels + len(together)))
+                if log_p < (np.log(RECORD_ENTRY_LEVEL) if best is None else best.log_p):
+                    one = int(np.nanargmax(np.abs(scaled[at]))) if number == channels else number
+                    best = _Seen(log_p, at + mean, gap, mean, one)
+        return best
+
+    def scaled(self, gap: int, mean: int) -> Array:
+        """Changes over a window beside those of temperatures and loads, in robust standard deviations of their channel."""
+        channels = self.response.shape[1]
+        if (gap, mean) not in self.excursions:
+            number = max(0, self.seconds.size - gap - 2 * mean + 1)
+            self.excursions[gap, mean] = np.full((number, channels), np.nan)
+            self.slopes[gap, mean] = np.zeros((self.moved.shape[1], channels))
+            self.changed[gap, mean] = set(range(channels))
+        scaled, slopes, outdated = self.excursions[gap, mean], self.slopes[gap, mean], sorted(self.changed[gap, mean])
+        if not outdated:
+            return scaled
+        self.changed[gap, mean] = set()
+        response, moved = (_changes(values, gap, mean) for values in (self.response[:, outdated], self.moved))
+        known = np.isfinite(moved[:, 0])
+        if known.sum() < _PER_COLUMN:
+            return scaled
+        basis = _leading(moved[known], known.sum() / (gap + 2 * mean))
+        courses = moved @ basis
+        for k, changes in zip(outdated, response.T, strict=True):
+            rows = np.flatnonzero(np.isfinite(changes) & known)
+            scaled[:, k] = np.nan
+            if rows.size < _PER_COLUMN:
+                continue
+            own = _robust_slopes(changes[rows], courses[rows])
+            slopes[:, k], left = basis @ own, changes - courses @ own
+            left -= np.median(left[rows])
+            scaled[:, k] = left / (1.4826 * np.median(np.abs(left[rows])) or np.inf)
+        return scaled
+
+    def load_that_changes(self, seen: _Seen) -> str:
+        """A temperature or load that changes over the window of an event as at hardly any other time; empty where none does."""
+        moved = np.abs(_changes(self.moved[:, : len(self.names)], seen.gap, seen.mean))
+        here = np.nanmax(moved[max(0, seen.at - 2 * seen.mean) : seen.at + 1], axis=0, initial=0.0)
+        for name, all_of_it, own in zip(self.names, moved[np.isfinite(moved[:, 0])].T, here, strict=True):
+            scale = 1.4826 * float(np.median(all_of_it))
+            if own > _UNUSUAL * scale and own > 0.0 and (all_of_it >= own).mean() < _SELDOM:
+                return name
+        return ""
+
+    def ignore(self, seen: _Seen, channels: slice | int) -> None:
+        """Leave the window of a change out of every later look at its channel, or at all of them."""
+        first, last = seen.at - seen.mean, seen.at + seen.gap + seen.mean
+        for (gap, mean), scaled in self.excursions.items():
+            scaled[max(0, first - gap - mean) : max(0, last + 1), channels] = np.nan
+
+    def closer(self, seen: _Seen, digits: Array) -> Event | None:
+        """Onset, duration and size of a change by the likelihood of the readings around it; None where these show none."""
+        left = self.response - self.moved @ self.slopes[seen.gap, seen.mean]
+        half, longest, looks = (
+            3 * max(seen.gap, seen.mean, 2 * _SHORTEST),
+            left.shape[0] // 8,
+            list[tuple[_Look, Course, Array, Array]](),
+        )
+        # A longer look shows whether more of the change follows; where it does not, the shorter one dates it better.
+        while True:
+            if (looked := _Look.at(self, left, seen, half)) is None:
+                return None
+            best = looked.best([seen.channel])
+            looks.append((looked, best, *looked.sizes(best)))
+            half *= 2
+            if len(looks) > 1 and _is_settled(looks[-2], looks[-1], seen.channel):
+                looks.pop()
+                break
+            if half > longest and len(looks) > 1:
+                break
+        looked, best, size, u = looks[-1]
+        part = np.abs(size) > _TAKES_PART * u
+        part &= np.abs(size) > digits
+        if not part[seen.channel]:
+            return None
+        channels = list(np.flatnonzero(part))
+        best = looked.best(channels)
+        size, u = looked.sizes(best)
+        onset, duration, u_course = looked.intervals(best, channels)
+        if onset.low <= looked.earliest_s:
+            return None
+        return Event(
+            columns=np.empty((0, 1)),
+            parameters={"time_s": onset.value, "duration_min": duration.value / 60.0, "course": best.words},
+            units=("um",),
+            event_s=onset.value,
+            course=best,
+            onset=onset,
+            duration=duration,
+            size=np.where(part, size, 0.0),
+            size_u=np.where(part, np.hypot(u, u_course), 0.0),
+            p_value=min(1.0, float(np.exp(seen.log_p))),
+            answer=looked.answer(best, seen.channel),
+        )
+
+    def take_out(self, event: Event) -> None:
+        """Go on without an event."""
+        self.response -= event.course.at(self.seconds)[:, None] * event.size
+        self._compute_again(event.size != 0.0)
+
+    def leave_out(self, channels: NDArray[np.bool_]) -> None:
+        """Go on without some channels."""
+        self.response[:, channels] = np.nan
+        self._compute_again(channels)
+
+    def _compute_again(self, channels: NDArray[np.bool_]) -> None:
+        for window in self.changed:
+            self.changed[window] |= set(np.flatnonzero(channels).tolist())
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Readings around a change, with the courses that it may have.
+
+    Attributes
+    ----------
+    seconds, instants : middle of every point (points,), and of its cells (points, cells), s
+    courses : tried ones; those with a part at once stand for any share of it
+    gain : (courses, channels) in log-likelihood beside a level, under noise and a random walk of the channel's own size
+    size : (courses, channels) um, of the whole change
+    parts : (courses, channels) share of it that happened at once
+    whitened : of every channel the points that it has, their covariance, um², and the readings, um
+    """
+
+    seconds: Array
+    instants: Array
+    spacing_s: float
+    courses: list[Course]
+    gain: Array
+    size: Array
+    parts: Array
+    whitened: list[tuple[NDArray[np.intp], Array, Array]]
+
+    @classmethod
+    def at(cls, cells: _Cells, left: Array, seen: _Seen, half: int) -> _Look | None:
+        """Look at the readings within `half` cells of the window of a change, of its own run; None where they are too few."""
+        known = np.isfinite(cells.seconds)
+        first, last = seen.at, seen.at + seen.gap
+        while first > max(0, seen.at - half) and known[first - 1]:
+            first -= 1
+        while last < min(known.size - 1, seen.at + seen.gap + half) and known[last + 1]:
+            last += 1
+        group = max(1, -(-(last + 1 - first) // _POINTS))
+        number = (last + 1 - first) // group
+        if number < _LEAST_POINTS:
+            return None
+        here = slice(first, first + number * group)
+        seconds = cells.seconds[here].reshape(number, group)
+        values = left[here].reshape(number, group, -1)
+        with np.errstate(invalid="ignore"):
+            values = values.sum(axis=1) / group
+        spacing = group * cells.step_s
+        width = number * spacing
+        onsets = seconds.mean(axis=1)[2:-2] - 0.5 * cells.step_s
+        if group > 1:
+            onsets = np.sort(np.concatenate([onsets, onsets + 0.5 * spacing]))
+        courses = [
+            Course(float(onset), share * width, settles, at_once)
+            for onset in onsets
+            for settles, at_once in ((False, 0.0), (True, 0.0), (True, 0.5))
+            for share in _DURATIONS
+            if share * width >= 2.0 * spacing or not (share or settles)
+        ]
+        columns = np.column_stack([one.at(seconds.ravel()).reshape(number, group).mean(axis=1) for one in courses])
+        instants = {float(onset): k for k, onset in enumerate(onsets)}
+        steps = np.column_stack(
+            [Course(float(onset), 0.0).at(seconds.ravel()).reshape(number, group).mean(axis=1) for onset in onsets]
+        )
+        place = np.array([instants[one.onset_s] for one in courses])
+        two = np.array([one.at_once > 0.0 for one in courses])
+        gain, size, parts = (np.zeros((len(courses), values.shape[1])) for _ in range(3))
+        whitened = []
+        for k, response in enumerate(values.T):
+            rows = np.flatnonzero(np.isfinite(response))
+            noise, walk = _noise_and_walk(left[:, k], 2 * half)
+            covariance = walk * group * np.minimum(rows[:, None], rows) + noise / group * np.eye(rows.size)
+            whitened.append((rows, covariance, response[rows]))
+            if rows.size < _LEAST_POINTS:
+                continue
+            root: Array = np.asarray(np.linalg.cholesky(covariance), float)
+            y, x, s = (_beside_a_level(root, each[rows]) for each in (response[:, None], columns, steps))
+            y = y[:, 0]
+            own = np.einsum("ij,ij->j", x, x) + 1e-12
+            size[:, k] = x.T @ y / own
+            gain[:, k] = 0.5 * size[:, k] ** 2 * own
+            # A part at once and a rest that settles: two columns.
+            rest, now = 2.0 * x[:, two] - s[:, place[two]], s[:, place[two]]
+            a, b, c = (np.einsum("ij,ij->j", u, v) for u, v in ((now, now), (now, rest), (rest, rest)))
+            u, v, det = now.T @ y, rest.T @ y, np.maximum(a * c - b * b, 1e-12 * a * c + 1e-300)
+            first_part, second = (c * u - b * v) / det, (a * v - b * u) / det
+            both = first_part + second
+            with np.errstate(divide="ignore", invalid="ignore"):
+                parts[two, k] = first_part / both
+            is_one_change = (parts[two, k] > 0.05) & (parts[two, k] < 0.95)
+            size[two, k] = both
+            gain[two, k] = np.where(is_one_change, 0.5 * (first_part * u + second * v), -np.inf)
+            misfit = (y @ y - 2.0 * gain[:, k].max()) / max(1, rows.size - 4)
+            gain[:, k] /= max(1.0, misfit)
+        return cls(seconds.mean(axis=1), seconds, spacing, courses, gain, size, parts, whitened)
+
+    @property
+    def width_s(self) -> float:
+        """How long it is, s."""
+        return self.seconds.size * self.spacing_s
+
+    @property
+    def earliest_s(self) -> float:
+        """The first onset that was tried, s: what began before has no onset here."""
+        return self.courses[0].onset_s
+
+    def best(self, channels: list[int]) -> Course:
+        """The course that fits these channels best, with the share at once that the one which shows it most has."""
+        parts = np.array([one.at_once > 0.0 for one in self.courses])
+        number = int(np.argmax(self.gain[:, channels].sum(axis=1) - _SECOND_PART * parts))
+        course = self.courses[number]
+        if not course.at_once:
+            return course
+        strongest = channels[int(np.argmax(self.gain[number, channels]))]
+        return course._replace(at_once=float(self.parts[number, strongest]))
+
+    def sizes(self, course: Course, every: slice = slice(None)) -> tuple[Array, Array]:
+        """Size of a course in every channel by these points, and its standard uncertainty, um; infinite where they are too few."""
+        size, u = np.zeros(len(self.whitened)), np.full(len(self.whitened), np.inf)
+        shares = course.at(self.instants.ravel()).reshape(self.instants.shape).mean(axis=1)
+        for k, (rows, covariance, response) in enumerate(self.whitened):
+            some = np.arange(rows.size)[every]
+            if some.size < _LEAST_POINTS:
+                continue
+            root = np.linalg.cholesky(covariance[np.ix_(some, some)])
+            y, x = (_beside_a_level(root, each[:, None])[:, 0] for each in (response[some], shares[rows[some]]))
+            own = float(x @ x)
+            size[k] = float(x @ y) / max(own, 1e-12)
+            misfit = float(((y - size[k] * x) ** 2).sum()) / (some.size - 2)
+            u[k] = np.sqrt(max(1.0, misfit) / own) if own > 1e-9 else np.inf
+        return size, u
+
+    def intervals(self, best: Course, channels: list[int]) -> tuple[Interval, Interval, Array]:
+        """Onset and duration, s, with all values that fit nearly as well, and what these leave open of the sizes, um."""
+        total = self.gain[:, channels].sum(axis=1)
+        fits = total >= total.max() - _WITHIN
+        weights = np.exp(total[fits] - total.max())
+        middle = np.average(self.size[fits], axis=0, weights=weights)
+        u = np.sqrt(np.average((self.size[fits] - middle) ** 2, axis=0, weights=weights))
+        tried, lasting = (np.array([getattr(one, name) for one in self.courses]) for name in ("onset_s", "duration_s"))
+        onsets, all_onsets, durations, all_durations = tried[fits], np.unique(tried), lasting[fits], np.unique(lasting)
+
+        def beside(values: Array, edge: float, by: int) -> float:
+            return float(values[np.clip(np.searchsorted(values, edge) + by, 0, values.size - 1)])
+
+        onset = Interval(best.onset_s, beside(all_onsets, onsets.min(), -1), beside(all_onsets, onsets.max(), 1))
+        shortest = beside(all_durations, durations.min(), -1) if durations.min() else 0.0
+        longest = beside(all_durations, durations.max(), 1) if durations.max() < all_durations[-1] else np.inf
+        return onset, Interval(best.duration_s, shortest, longest), u
+
+    def answer(self, course: Course, channel: int) -> Answer:
+        """What every other point says of the size of a change in a channel that the points between show."""
+        (size, u), (other, other_u) = (
+            [float(one[channel]) for one in self.sizes(course, slice(k, None, 2))] for k in (0, 1)
+        )
+        if not np.isfinite(u + other_u) or not size:
+            return Answer(where=_EVERY_OTHER)
+        slope = other / size
+        return Answer(
+            slope, float(np.hypot(other_u, slope * u)) / abs(size), self.seconds.size // 2, where=_EVERY_OTHER
+        )
+
+
+def _is_settled(
+    shorter: tuple[_Look, Course, Array, Array], longer: tuple[_Look, Course, Array, Array], channel: int
+) -> bool:
+    """Whether a longer look at a change makes it no larger."""
+    looked, course, size, u = shorter
+    room = course.duration_s < 0.3 * looked.width_s
+    return room and bool(np.abs(longer[2] - size)[channel] < _SAME_SIZE * max(u[channel], longer[3][channel]))
+
+
+def _means(values: Array, place: NDArray[np.intp], number: int) -> Array:
+    """Means of values (n, columns) in every cell, NaN where there is none."""
+    means = np.full((number, values.shape[1]), np.nan)
+    for k, column in enumerate(values.T):
+        known = np.isfinite(column)
+        count = np.bincount(place[known], minlength=number)
+        total = np.bincount(place[known], column[known], minlength=number)
+        means[:, k] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return means
+
+
+def _changes(values: Array, gap: int, mean: int) -> Array:
+    """Mean of `mean` cells after a gap less that of as many before it (windows, columns); NaN where half of either is missing."""
+    known = np.isfinite(values)
+    zero = np.zeros((1, values.shape[1]))
+    total = np.concatenate([zero, np.cumsum(np.where(known, values, 0.0), axis=0)])
+    count = np.concatenate([zero, np.cumsum(known, axis=0)])
+    total, count = total[mean:] - total[:-mean], count[mean:] - count[:-mean]
+    mean_of = np.where(count >= 0.5 * mean, total / np.maximum(count, 1.0), np.nan)
+    return np.asarray(mean_of[gap + mean :] - mean_of[: mean_of.shape[0] - gap - mean])
+
+
+def _leading(moved: Array, windows: float) -> Array:
+    """Leading combinations (columns, kept) of the changes (n, columns) of temperatures and loads, no more than the windows determine."""
+    some = moved[:: max(1, len(moved) // _ROWS)]
+    spread = some.std(axis=0)
+    weights = np.divide(1.0, spread, out=np.zeros_like(spread), where=spread > 1e-12)
+    _, size, directions = np.linalg.svd(some * weights, full_matrices=False)
+    kept = min(int(windows / _PER_COLUMN), int((size > 1e-6 * max(float(size[0]), 1e-300)).sum()))
+    return np.asarray(weights[:, None] * directions[:kept].T)
+
+
+def _robust_slopes(changes: Array, courses: Array) -> Array:
+    """Slopes (columns,) of changes (n,) against those of temperatures and loads (n, columns), beside a rate (Huber)."""
+    some = slice(None, None, max(1, changes.size // _ROWS))
+    y, design = changes[some], np.column_stack([courses[some], np.ones(changes[some].size)])
+    weights, slopes = np.ones(y.size), np.zeros(design.shape[1])
+    for _ in range(_ITERATIONS):
+        weighted = design * weights[:, None]
+        slopes = np.linalg.lstsq(weighted.T @ design, weighted.T @ y, rcond=None)[0]
+        left = np.abs(y - design @ slopes)
+        weights = np.minimum(1.0, _HUBER * 1.4826 * float(np.median(left)) / np.maximum(left, 1e-300))
+    return np.asarray(slopes[:-1])
+
+
+def _log_p(excursions: Array, width: int) -> tuple[int, float]:
+    """Place of the largest of many excursions, and the logarithm of the probability that any is as large.
+
+    The largest of every window of `width` are taken as independent. Beyond their median they are exponential, whose scale is estimated
+    without the largest ones, which may be events (type II censoring, Epstein and Sobel 1953); a further one is then Lomax distributed.
+    """
+    excursions = excursions**_TAIL
+    windows = excursions.size // width
+    padded = (
+        np.nan_to_num(excursions[: windows * width], nan=-1.0).reshape(windows, width).max(axis=1)
+        if windows
+        else excursions[:0]
+    )
+    largest = np.sort(padded[padded >= 0.0])[::-1]
+    at = int(np.nanargmax(excursions)) if np.isfinite(excursions).any() else 0
+    above = largest.size // 2
+    censored = max(_CENSORED, int(_CENSORED_SHARE * largest.size))
+    freedom = above - censored
+    if freedom < _LEAST_FREEDOM:
+        return at, 0.0
+    median = largest[above]
+    beyond = largest[:above] - median
+    scale = (beyond[censored:].sum() + censored * beyond[censored]) / freedom
+    if scale <= 0.0:
+        return at, 0.0
+    return at, float(np.log(above) - freedom * np.log1p((excursions[at] - median) / (freedom * scale)))
+
+
+def _noise_and_walk(values: Array, longest: int) -> tuple[float, float]:
+    """Variances of a reading's noise and of a random walk's step from cell to cell, by the medians of changes over several times."""
+    lags = np.unique(np.geomspace(1, max(2, min(longest, values.size // 4)), 8).astype(int))
+    variances = []
+    for lag in lags:
+        changes = np.abs(values[lag:] - values[:-lag])
+        changes = changes[np.isfinite(changes)]
+        variances.append((1.4826 * float(np.median(changes))) ** 2 if changes.size else np.nan)
+    known = np.isfinite(variances) & (np.asarray(variances) > 0.0)
+    if not known.any():
+        return 1e-12, 1e-12
+    variance, lags = np.asarray(variances)[known], lags[known]
+    noise, walk = optimize.nnls(np.column_stack([2.0 / variance, lags / variance]), np.ones(variance.size))[0]
+    least = 1e-3 * float(variance.min())
+    return max(float(noise), least), max(float(walk), least / longest)
+
+
+def _beside_a_level(root: Array, columns: Array) -> Array:
+    """Columns (points, n) whitened by the root of their covariance, without a level."""
+    number = columns.shape[0]
+    laid = linalg.solve_triangular(root, np.column_stack([np.ones(number), columns]), lower=True)
+    basis = laid[:, :1] / np.linalg.norm(laid[:, :1])
+    return np.asarray(laid[:, 1:] - basis @ (basis.T @ laid[:, 1:]))
