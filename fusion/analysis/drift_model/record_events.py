@@ -52,7 +52,7 @@ _TAIL = 1.5
 _LEAST_READINGS, _LEAST_POINTS, _LEAST_FREEDOM, _ITERATIONS = 40, 8, 3, 5
 _EVERY_OTHER = "in every other reading around it"
 #: More events than this in one channel are a switching that nobody logged.
-MOST_OF_A_CHANNEL = 4
+MOST_OF_A_CHANNEL = 3
 
 
 class Interval(NamedTuple):
@@ -283,7 +283,7 @@ class _Cells:
     def load_that_changes(self, seen: _Seen) -> str:
         """A temperature or load that changes over the window of an event as at hardly any other time; empty where none does."""
         moved = np.abs(_changes(self.moved[:, : len(self.names)], seen.gap, seen.mean))
-        here = np.nanmax(moved[max(0, seen.at - 2 * seen.mean) : seen.at + 1], axis=0, initial=0.0)
+        here = moved[seen.at - seen.mean]
         for name, all_of_it, own in zip(self.names, moved[np.isfinite(moved[:, 0])].T, here, strict=True):
             scale = 1.4826 * float(np.median(all_of_it))
             if own > _UNUSUAL * scale and own > 0.0 and (all_of_it >= own).mean() < _SELDOM:
