@@ -26,7 +26,7 @@ def registry(tmp_path: Path) -> Path:
 
 def test_every_listed_file_has_a_public_address_a_hash_and_a_licence() -> None:
     listed = read_registry()
-    assert len(listed) == 56
+    assert len(listed) == 55
     for dataset in listed.values():
         address = urlparse(dataset.address)
         assert (address.scheme, address.netloc) == ("https", "raw.githubusercontent.com")

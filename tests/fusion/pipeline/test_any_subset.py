@@ -368,7 +368,15 @@ def test_a_test_without_a_course_has_the_values_of_the_command_and_no_drift(tmp_
     assert results.iso230.unit == ("arcsec" if renamed else "um")
     assert results.drift is results.neighbours is results.loop is results.anomalies is None
     assert results.warnings[0].code == "standard_alone"
-    assert sections(tmp_path / "results") == {"next", "iso230", "data", "uncertainty", "glossary", "provenance"}
+    assert sections(tmp_path / "results") == {
+        "next",
+        "iso230",
+        "data",
+        "appendix",
+        "uncertainty",
+        "glossary",
+        "provenance",
+    }
     text = re.sub("<script.*?</script>", "", (tmp_path / "results/report.html").read_text(encoding="utf-8"), flags=re.S)
     assert ("µm" in text) is not bool(renamed)
     told = dict(summary_rows(results))["how much"]

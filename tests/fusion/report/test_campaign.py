@@ -173,7 +173,7 @@ def test_steps_start_with_the_declared_model_and_a_doubt_has_its_reason():
     declared, added = model_section.steps_table(LOOP).rows
     assert declared.cells == ["0", "declared: expansion of the axis", "\u2013", "0.60", "\u2013", "", ""]
     assert added.marked
-    told = "sudden step or new zero: 30 min after the start (at least 28 min), shape flat (or linear)"
+    told = "sudden step or new zero: 1.00 ± 0.20 µm, 30 min after the start (at least 28 min), shape flat (or linear)"
     assert added.cells[1:3] == [told, "< 0.001"]
     assert added.cells[3:6] == ["0.60 → 0.40", "0.70 → 0.50", "yes"]
     assert added.cells[-1] == "dead path of the laser (log-likelihood lower by 4.0)"

@@ -123,9 +123,9 @@ def test_the_largest_of_noisy_values_is_covered():
 
 
 def test_a_negative_uncertainty_is_refused_and_a_temperature_below_20_degC_is_none():
-    with pytest.raises(ValueError, match="device_ppm=-1 is negative"):
+    with pytest.raises(ValueError, match="device_ppm=-1: give a finite number, 0 or more"):
         Iso230Budget(device_ppm=-1)
-    with pytest.raises(ValueError, match=r"environmental_variation_um=-0\.1 is negative"):
+    with pytest.raises(ValueError, match=r"environmental_variation_um=-0\.1: give a finite number, 0 or more"):
         Iso230Budget(environmental_variation_um=-0.1)
     assert Iso230Budget(difference_from_20_degC_K=-2.0).difference_from_20_degC_K == -2.0
 

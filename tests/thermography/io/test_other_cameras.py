@@ -564,15 +564,6 @@ def test_a_tall_picture_is_one(tmp_path):
         assert READER.contents(tmp_path / "a.csv", StackOptions()).shape == (48, 32)
 
 
-@pytest.mark.real_data
-def test_the_export_of_an_optris_camera_is_read(real_file):
-    path = real_file("loochlabs__temperature_parser/data/examples/Ellesmere_IR_flight01_1000ft_000163.csv")
-    values = READER.read_values(path, 0, StackOptions())
-    assert values.shape == (288, 382)
-    # Its lines below the first, which states the size, by numpy alone.
-    np.testing.assert_array_equal(values, np.loadtxt(path, delimiter=",", skiprows=1))
-
-
 @pytest.mark.parametrize("order", ["tyx", "yxt", "txy", "xyt"])
 @pytest.mark.parametrize("engine", ["h5netcdf", "scipy"])
 def test_dimensions_of_a_store_are_known_by_name(tmp_path, order, engine):
