@@ -45,11 +45,13 @@ _BRACKETS = re.compile(r" \([^()]*\)")
 #: Where a sentence may end before its end.
 _CLAUSE = re.compile(r"[;:] |, and | for ")
 _CONDITION = re.compile(r"^Only if [^:]+: ")
+_UNCONFIRMED = re.compile(r"^Not confirmed, check this only where nothing else is found: ")
 
 
 def in_brief(step: str) -> str:
     """Return the beginning of an action: its clauses as far as a line holds them, without what stands in brackets."""
-    sentence = _BRACKETS.sub("", _if_so(step)).split(". ")[0].rstrip(".")
+    step = _UNCONFIRMED.sub("Unconfirmed: ", _if_so(step))
+    sentence = _BRACKETS.sub("", step).split(". ")[0].rstrip(".")
     words = sentence.split()
     line = " ".join(words[:_WORDS])
     if len(words) <= _WORDS:

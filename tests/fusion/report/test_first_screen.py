@@ -127,6 +127,10 @@ def test_a_phone_shows_identity_decision_and_cause_first(reports, new_page):
             "Inspect guideway, scale, screw and nut at this position for preload, wear, contamination and looseness; repeat it.",
             "Inspect guideway, scale, screw and nut at this position.",
         ),
+        (
+            "Not confirmed, check this only where nothing else is found: look for play in the nut (cold), and measure again.",
+            "Unconfirmed: look for play in the nut, and measure again.",
+        ),
     ],
 )
 def test_an_action_is_cut_at_a_clause(step, line):
