@@ -1344,7 +1344,7 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
     for fault, name, run in moved:
         if fault.kind is not Kind.NO_SIGNAL and name not in proven:
             kept = [other for other in names if other not in {name, *dead}]
-            alone = errors(cleaned)
+            alone = errors(cleaned) if kept else {}
             if any(
                 error < _FOLLOWED * min(beside, alone.get(channel, np.inf))
                 for channel, error, beside in followed(fault, name, run)

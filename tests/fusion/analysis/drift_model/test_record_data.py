@@ -307,6 +307,15 @@ def test_a_sound_record_passes_as_it_is():
     assert health.findings == ()
 
 
+def test_the_only_sensor_of_a_record_may_break(rng):
+    temperature = 20.0 + np.linspace(0.0, 5.0, 60)[:, None]
+    displacement = 6.0 * (temperature - 20.0) + 0.01 * rng.standard_normal((60, 1))
+    temperature[29:] += 51.0
+    health = examine_record(table_of(displacement, temperature, step_s=300.0), ["quasi_static"])
+    assert health.table["sensor"].values.tolist() == ["t1"]
+    assert [(one.sensor, one.kind, one.state) for one in health.findings] == [("t1", "jump", "suspected")]
+
+
 def test_a_sensor_that_breaks_is_left_out_and_the_error_with_it_is_stated():
     table = twin_table(seed=31)
     table["temperature"][900:, 2] += 28.0
