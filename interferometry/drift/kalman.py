@@ -270,12 +270,25 @@ def carry_back(columns: Array, order: int, components: int, memory: Array, step:
 
 @njit()
 def observe_back(
-    N: Array, order: int, loadings: Array, k: int, memory: Array, gains: Array, innovation_variance: float, NM: Array
+    N: Array,
+    order: int,
+    loadings: Array,
+    k: int,
+    memory: Array,
+    gains: Array,
+    innovation_variance: float,
+    observed: bool,
+    step: float,
+    NM: Array,
 ) -> float:
-    """Add a reading to the information N of those after it, in place; write N times its gain into ``NM`` and return the variance of its
-    smoothing error, D = 1 / F + K' N K (Durbin and Koopman 2012, eq. 4.69).
+    """Take the information N of the readings after one back to it and add it, in place; write N times its gain into ``NM`` and return the
+    variance of its smoothing error, D = 1 / F + K' N K (Durbin and Koopman 2012, eq. 4.69); zero where it was not observed.
     """
     m, components = N.shape[0], loadings.shape[1]
+    carry_back(N, order, components, memory, step)
+    carry_back(N.T, order, components, memory, step)
+    if not observed:
+        return 0.0
     D = 1.0 / innovation_variance
     for i in range(m):
         NM[i] = 0.0
@@ -361,17 +374,15 @@ def products_of_sparse(
     with_dense = np.zeros((columns, innovations.shape[1]))
     for k in range(n - 1, -1, -1):
         step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
-        if order == 2 or memory.size:
-            carry_back(N, order, components, memory, step)
-            carry_back(N.T, order, components, memory, step)
+        variance = innovation_variances[k]
+        D[k] = observe_back(N, order, loadings, k, memory, gains, variance, observed[k], step, h[k])
         if observed[k]:
-            D[k] = observe_back(N, order, loadings, k, memory, gains, innovation_variances[k], h[k])
             for c in range(components):
                 h[k, c * order] -= D[k] * loadings[k, c]
             if memory.size:
                 h[k, components * order] -= D[k]
         u = innovations[k]
-        smoothing_error(r, order, loadings, k, memory, gains, innovation_variances[k], observed[k], step, u)
+        smoothing_error(r, order, loadings, k, memory, gains, variance, observed[k], step, u)
         for at in range(starts[k], starts[k + 1]):
             for j in range(u.size):
                 with_dense[places[at], j] += values[at] * u[j]
@@ -429,12 +440,9 @@ def smooth(
     NM = np.zeros(m)
     for k in range(n - 1, -1, -1):
         step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
-        if order == 2 or memory.size:
-            carry_back(N, order, components, memory, step)
-            carry_back(N.T, order, components, memory, step)
-        if observed[k]:
-            D[k] = observe_back(N, order, loadings, k, memory, gains, innovation_variances[k], NM)
-        smoothing_error(r, order, loadings, k, memory, gains, innovation_variances[k], observed[k], step, u[k])
+        variance = innovation_variances[k]
+        D[k] = observe_back(N, order, loadings, k, memory, gains, variance, observed[k], step, NM)
+        smoothing_error(r, order, loadings, k, memory, gains, variance, observed[k], step, u[k])
         _smooth_levels(order, covariances[k], r, N, levels[k], level_covariance[k])
     return levels, level_covariance, u, D
 
