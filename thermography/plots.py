@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from thermography.common import ThermographyError
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
+#: Maps of a contact sheet, in so many columns: few enough to be read on a page.
+ON_SHEET, SHEET_COLUMNS = 12, 3
 #: Quantity of the fields -> label with its unit, and colour map.
 _QUANTITIES = {
     "temperature_rise": ("temperature rise / K", "inferno"),
@@ -81,6 +84,12 @@ def plot_field(
     unit = fields["x"].attrs.get("units", "mm")
     ax.set(xlabel=f"x / {unit}", ylabel=f"y / {unit}", title=f"cycle {number}")
     return ax
+
+
+def cycles_on_sheet(fields: xr.Dataset) -> NDArray[np.intp]:
+    """Return the places of at most `ON_SHEET` cycles spread over the test, with the first and the last."""
+    count = fields.sizes["cycle"]
+    return np.unique(np.linspace(0, count - 1, min(ON_SHEET, count)).round().astype(int))
 
 
 def field_scale(fields: xr.Dataset, quantity: str) -> tuple[float, float]:

@@ -309,10 +309,14 @@ def findings(results: Results) -> list[Finding]:
         add("unexplained", of=loop, tile="Unexplained variance")
         for run in (one for one in loop.runs if one.held_out):
             add("run_line", f"run {run.file}", run)
-    add("next", "next", text="\n".join(f"{number}. {step}" for number, step in enumerate(next_steps(results), start=1)))
+    add("next", "next", text=_numbered(next_steps(results)))
     for warning in results.warnings:
         add("warning", "warning", text=warning.message)
     return found
+
+
+def _numbered(steps: list[str]) -> str:
+    return "\n".join(f"{number}. {step}" for number, step in enumerate(steps, start=1))
 
 
 def _quoted(results: Results, iso: Iso230Part) -> dict[str, str]:
@@ -339,23 +343,22 @@ def _scatter_range(drift: DriftPart) -> str:
 
 def summary_table(results: Results) -> rich.table.Table:
     """Return the findings of a run as a table for the terminal."""
-    printed = rich.table.Table(title=cell(results.campaign), title_justify="left", show_header=False, pad_edge=False)
-    printed.add_column(no_wrap=True)
-    printed.add_column(overflow="fold")
-    for name, text in summary_rows(results):
-        # Names of keys stand in brackets, which rich would take for styles.
-        printed.add_row(cell(name), cell(text))
-    return printed
+    return _printed(results, summary_rows(results))
 
 
 def brief_table(results: Results) -> rich.table.Table:
     """Return what the first screen of the report says as a table of about twelve lines for the terminal."""
+    return _printed(results, brief_rows(results), box=None)
+
+
+def _printed(results: Results, rows: list[tuple[str, str]], **looks: Any) -> rich.table.Table:
     printed = rich.table.Table(
-        title=cell(results.campaign), title_justify="left", show_header=False, pad_edge=False, box=None
+        title=cell(results.campaign), title_justify="left", show_header=False, pad_edge=False, **looks
     )
     printed.add_column(no_wrap=True)
     printed.add_column(overflow="fold")
-    for name, text in brief_rows(results):
+    for name, text in rows:
+        # Names of keys stand in brackets, which rich would take for styles.
         printed.add_row(cell(name), cell(text))
     return printed
 
@@ -363,7 +366,7 @@ def brief_table(results: Results) -> rich.table.Table:
 def brief_rows(results: Results) -> list[tuple[str, str]]:
     """Return names and texts of what the first screen of the report says."""
     first = first_screen(results, {}, "", "")
-    steps = "\n".join(f"{number}. {step}" for number, step in enumerate(first["next"], start=1))
+    steps = _numbered(first["next"])
     rows = [("in doubt", first["open"]), ("decision", first["decision"]), ("cause", first["cause"])]
     rows += [(one.tile.name, one.tile.value) for one in findings(results) if one.tile]
     return [(name, text) for name, text in (*rows, ("next", steps)) if text]

@@ -31,6 +31,7 @@ from fusion.results.numbers import join, number, place
 from fusion.results.parts import AreaPart, ContactSensorPart
 from interferometry.plots import ACCENT, INK
 from thermography.large_arrays import in_pieces
+from thermography.plots import SHEET_COLUMNS, cycles_on_sheet
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
 _STEP_PER_K = 32
@@ -231,24 +232,24 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
     return Chart(drawn, seen, columns)
 
 
-#: Cycles of the contact sheet, spread over the test, in so many columns, and its cells in a row of one of them.
-_ON_SHEET, _SHEET_COLUMNS, _SHEET_CELLS = 12, 3, 80
+#: Cells in a row of a map of the contact sheet.
+_SHEET_CELLS = 80
 
 
 def plot_contact_sheet(fields: xr.Dataset) -> Chart:
     """Draw the rise of the table in cycles spread over the test beside each other, on one scale: what paper shows of the map."""
     count = fields.sizes["cycle"]
-    chosen = np.unique(np.linspace(0, count - 1, min(_ON_SHEET, count)).round().astype(int))
+    chosen = cycles_on_sheet(fields)
     block = max(1, -(-fields.sizes["x"] // _SHEET_CELLS))
     rise = fields["temperature_rise"].isel(cycle=chosen).load()
     rise = rise.coarsen(x=block, y=block, boundary="trim").mean() if block < min(rise.shape[1:]) else rise
     left, right, bottom, top = extent_of(fields)
     width, height, cycles = right - left, top - bottom, rise["cycle"].values.tolist()
-    down, across = np.divmod(np.arange(chosen.size), _SHEET_COLUMNS)
+    down, across = np.divmod(np.arange(chosen.size), SHEET_COLUMNS)
     label = 0.13 * width  # a name of 11 px above a map, on a narrow screen too
     x, y = across * 1.06 * width, down * (height + label) + label
     rows = int(down[-1]) + 1
-    sheet = (-0.01 * width, 1.06 * width * _SHEET_COLUMNS, rows * (height + label), 0.0)
+    sheet = (-0.01 * width, 1.06 * width * SHEET_COLUMNS, rows * (height + label), 0.0)
     scale = scale_of(rise.values, LAYERS[0])
     pixels = round(min(640.0, 520 * sheet[2] / sheet[1])) + 70
     drawn = new_figure(x="", y="", height=pixels, x_range=sheet[:2], y_range=sheet[2:])

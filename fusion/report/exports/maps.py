@@ -18,15 +18,13 @@ from PIL import Image
 from fusion.results.axis import HotspotPart
 from fusion.results.numbers import moment
 from thermography.pictures import write_gif, write_mp4
-from thermography.plots import draw_field, field_scale, plot_field
+from thermography.plots import SHEET_COLUMNS, cycles_on_sheet, draw_field, field_scale, plot_field
 
 FORMATS = ("png", "gif", "mp4")
 #: What a picture shows of a cycle, one below the other.
 _QUANTITIES = ("temperature", "temperature_rise")
 #: Width of a picture, inches, and its resolution, px per inch.
 _WIDTH, _DPI = 8.0, 120
-#: Pictures of a contact sheet in three columns: few enough to be read on a page.
-_ON_SHEET, _COLUMNS = 12, 3
 #: Length at which a film goes through all cycles, s, between its slowest and fastest rate, 1/s.
 _FILM_S, _SLOWEST_HZ, _FASTEST_HZ = 20.0, 2.0, 25.0
 
@@ -116,10 +114,10 @@ def _write_png(path: Path, drawing: CyclePictures, cycle: int) -> None:
 def _write_contact_sheet(path: Path, fields: xr.Dataset, title: str) -> None:
     """Write the rise in cycles spread over the test, beside each other on one scale."""
     cycles = fields["cycle"].values
-    chosen = cycles[np.unique(np.linspace(0, cycles.size - 1, min(_ON_SHEET, cycles.size)).round().astype(int))]
-    rows = -(-chosen.size // _COLUMNS)
+    chosen = cycles[cycles_on_sheet(fields)]
+    rows = -(-chosen.size // SHEET_COLUMNS)
     figure = Figure(figsize=(11.0, 0.8 + rows * (3.2 * _height_of(fields) + 0.5)), dpi=_DPI, layout="constrained")
-    panels = figure.subplots(rows, _COLUMNS, squeeze=False, sharex=True, sharey=True).ravel()
+    panels = figure.subplots(rows, SHEET_COLUMNS, squeeze=False, sharex=True, sharey=True).ravel()
     scale = field_scale(fields, "temperature_rise")
     for ax, cycle in zip(panels, chosen, strict=False):
         image = draw_field(fields, ax, int(cycle), "temperature_rise", scale)
