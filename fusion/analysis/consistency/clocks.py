@@ -193,7 +193,7 @@ def _clock(code: str, figures: tuple[Figures, ...]) -> Rule:
     """The check of one clock, of what all recordings together show."""
 
     def find(clocks: Mapping[str, Found]) -> Found | None:
-        """Every two recordings, at every quarter of an hour up to 14 h ([below](#the-odd-clock)): doubted where evidence of weight
+        """Every two recordings, at every quarter of an hour up to 14 h ([below](#inconsistent-clocks)): doubted where evidence of weight
         `_ENOUGH` contradicts the stated clocks, and this one moved alone ends every contradiction; `clocks` where several could be that
         one, or none; a contradiction where it leaves so few common times that a coverage would refuse.
         """
