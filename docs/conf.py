@@ -72,9 +72,9 @@ nb_merge_streams = True
 nb_ipywidgets_js = {}
 
 html_theme = "pydata_sphinx_theme"
-# MathJax that draws equations as SVG is one file and needs no font.
-html_static_path = ["_static", str(Path(mathjax.__file__).parent / "static" / "mathjax" / "es5" / "tex-svg.js")]
-mathjax_path = "tex-svg.js"
+# MathJax that draws equations as SVG is one file and needs no font; the smaller one fetches \boldsymbol from a file of its own.
+html_static_path = ["_static", str(Path(mathjax.__file__).parent / "static" / "mathjax" / "es5" / "tex-svg-full.js")]
+mathjax_path = "tex-svg-full.js"
 html_css_files = ["thermofuse.css"]
 html_show_sourcelink = False
 html_copy_source = False
