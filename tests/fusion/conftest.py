@@ -38,6 +38,21 @@ name = "reversal_drift"
 amplitude_um = 1.5
 """
 
+#: What a user may add: a line in the picture, tolerances and the machine.
+STATED = """
+[[thermography.region]]
+name = "edge"
+line = [["100 px", "200 px"], ["500 px", "200 px"]]
+
+[acceptance]
+A = "20 um"
+B = "1 um"
+
+[report]
+machine = "Mill 900"
+machine_serial_number = "4711"
+operator = "J. Doe"
+"""
 
 #: What decides the products of a run: the program, what it knows, and how tests make their campaigns.
 _SOURCES = ("thermofuse", "thermography", "interferometry", "fusion", "data", "tests/fusion")
@@ -120,6 +135,12 @@ def picture_results(part_results: Callable[..., Path]) -> Path:
     """The products of the pictures of the small campaign, whose fiducials nobody states."""
     pixels = '\n[plan]\nregistration = "pixels"\n'
     return part_results("pictures", "interferometry", "plan", "model", "drivers", added=pixels)
+
+
+@pytest.fixture(scope="session")
+def stated_results(part_results: Callable[..., Path]) -> Path:
+    """The products of the small campaign with a line in the picture, tolerances and the machine."""
+    return part_results("stated", added=STATED)
 
 
 @pytest.fixture

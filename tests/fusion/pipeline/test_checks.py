@@ -159,15 +159,12 @@ def test_a_doubt_is_found_before_anything_is_calculated(copied, lie, code):
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize(
-    ("lie", "code"), [(lies.inverted_signs, "axis_line"), (lies.emissivity_of_half, "material_rise")]
-)
 @pytest.mark.usefixtures("no_charts")
-def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(copied, tmp_path, lie, code):
-    lie(copied)
+def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(copied, tmp_path):
+    lies.inverted_signs(copied)
     results = run_campaign(copied / "campaign.toml", tmp_path / "out")
     assert results.inputs.state == "doubted"
-    assert code in [check.code for check in results.inputs.doubts]
+    assert "axis_line" in [check.code for check in results.inputs.doubts]
     assert results.warnings[0].code.startswith("doubt_")
     name, text = summary_rows(results)[0]
     assert name == "inputs" and text.startswith("doubted: ")
@@ -192,16 +189,3 @@ def test_a_doubt_can_be_accepted_and_an_unknown_one_is_refused(copied, tmp_path)
     assert (inputs.state, inputs.accepted) == ("sound", ("copied_cycles",))
     with pytest.raises(CampaignError, match=r"accept\.doubts = 'weather': no such check; there are"):
         run_campaign(change(path, "copied_cycles", "weather"), tmp_path / "other")
-
-
-@pytest.mark.usefixtures("no_charts")
-def test_one_error_of_reading_changes_neither_the_verdict_on_the_field_nor_the_causes(copied, tmp_path, results_folder):
-    lies.one_gross_reading(copied)
-    sound, spoilt = read_results(results_folder), run_campaign(copied / "campaign.toml", tmp_path / "out")
-    assert spoilt.correlation.verdict == sound.correlation.verdict
-    # One reading of 288 less; the p-values have a standard error of 0.016 from their 499 draws.
-    assert spoilt.correlation.source.p_value == pytest.approx(sound.correlation.source.p_value, abs=0.06)
-    assert [step.effect for step in spoilt.loop.steps] == [step.effect for step in sound.loop.steps]
-    assert spoilt.loop.rmse_final_um == pytest.approx(sound.loop.rmse_final_um, rel=0.02)
-    (notice,) = (warning for warning in spoilt.warnings if warning.code == "gross_readings")
-    assert "cycle 9, position 5 (200 mm), positive approach" in notice.message and "left out" in notice.message

@@ -226,6 +226,7 @@ def test_a_camera_step_is_taken_out_of_the_fields(tmp_path):
     assert float(np.abs(fields["temperature_rise"].mean(["y", "x"]).diff("cycle")).max()) < 0.3
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_nothing_is_added_where_nothing_is_missing(tmp_path):
     results, folder = run(tmp_path)
     loop = results["loop"]

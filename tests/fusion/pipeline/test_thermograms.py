@@ -243,23 +243,13 @@ def test_a_part_that_leaves_the_range_of_the_camera_is_said_so(tmp_path, real_fi
     assert re.search(r'id="pictures"', page) and results.field is None
 
 
-LINE = """
-[[thermography.region]]
-name = "edge"
-line = [["100 px", "200 px"], ["500 px", "200 px"]]
-"""
-
-
 @pytest.mark.chain
-def test_regions_of_the_picture_are_evaluated_beside_a_laser(campaign_folder, results_folder, tmp_path):
-    folder, out = shutil.copytree(campaign_folder, tmp_path / "in"), tmp_path / "out"
-    path = folder / "campaign.toml"
-    path.write_text(path.read_text(encoding="utf-8") + LINE, encoding="utf-8")
-    results, without = run_campaign(path, out), read_results(results_folder)
+def test_regions_of_the_picture_are_evaluated_beside_a_laser(stated_results, results_folder):
+    results, without = read_results(stated_results), read_results(results_folder)
     assert [one.name for one in results.regions] == ["whole picture", "edge"] and results.thermograms is None
-    assert results.regions[1].pictures == len(list((folder / "thermal").iterdir()))
+    assert results.regions[1].pictures == len(list((stated_results.parent / "campaign" / "thermal").iterdir()))
     assert results.drift == without.drift and without.regions is None
-    page = (out / "report.html").read_text(encoding="utf-8")
+    page = (stated_results / "report.html").read_text(encoding="utf-8")
     assert "Regions of the picture" in page and 'id="drawing-profile"' in page and 'id="drawing-region_history"' in page
 
 

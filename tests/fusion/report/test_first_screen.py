@@ -6,44 +6,29 @@ import pytest
 from playwright.sync_api import sync_playwright
 
 from fusion.pipeline.iso230 import read_test
-from fusion.pipeline.run import run_campaign
 from fusion.report import findings
 from fusion.report.findings import in_brief, sharpen
 from fusion.report.page import render_report
 from fusion.results.results import assemble, read_results
 from interferometry.iso230 import SAMPLING
 from tests.browser import CHROMIUM, visible_words
-from tests.fusion.campaign_parts import change, without
+from tests.fusion.campaign_parts import change
 from tests.fusion.report.test_campaign import ORIGIN
 from tests.fusion.report.test_record import record
 from tests.fusion.results_sample import RECORD_LOOP
 
 #: Words that are read in half a minute.
 MOST = 160
-STATED = """
-[acceptance]
-A = "20 um"
-B = "1 um"
-
-[report]
-machine = "Mill 900"
-machine_serial_number = "4711"
-operator = "J. Doe"
-"""
 
 
 @pytest.fixture(scope="module")
-def reports(campaign_folder, laser_results, camera_results, picture_results, tmp_path_factory):
+def reports(stated_results, laser_results, camera_results, picture_results, tmp_path_factory):
     """Reports of a campaign with both instruments, of either one alone, and of a record."""
-    folder = shutil.copytree(campaign_folder, tmp_path_factory.mktemp("first") / "campaign")
-    path = folder / "campaign.toml"
-    path.write_text(path.read_text(encoding="utf-8") + STATED, encoding="utf-8")
-    run_campaign(path, folder / "both")
     runs = {
-        "both": folder / "both", "laser": laser_results, "camera": camera_results, "pictures": picture_results
+        "both": stated_results, "laser": laser_results, "camera": camera_results, "pictures": picture_results
     }  # fmt: skip
     pages = {name: run / "report.html" for name, run in runs.items()}
-    pages["record"] = folder / "record.html"
+    pages["record"] = tmp_path_factory.mktemp("first") / "record.html"
     results = assemble("Spindle", {"loop": RECORD_LOOP}, [])
     pages["record"].write_text(render_report(results, ORIGIN, {"record": record(drivers=0)}), encoding="utf-8")
     return pages
@@ -138,16 +123,16 @@ def test_an_action_is_cut_at_a_clause(step, line):
 
 
 @pytest.mark.chain
-def test_the_sharper_uncertainty_is_what_the_statement_gives(reports):
+def test_the_sharper_uncertainty_is_what_the_statement_gives(stated_results, tmp_path):
     """The advice is computed from the budget; the run with the stated line gives the same uncertainty."""
-    folder = reports["both"].parent
-    advised = sharpen(read_results(folder).iso230)
+    ran = read_results(stated_results).iso230
+    advised = sharpen(ran)
     assert advised.line.startswith('expansion_coefficient = "') and advised.sharper_um < 0.8 * advised.expanded_um
-    campaign = folder.parent / "campaign.toml"
-    stated = change(without(campaign, name="stated.toml"), 'expansion_coefficient = "11.7 ppm/K"', advised.line)
+    campaign = shutil.copytree(stated_results.parent / "campaign", tmp_path / "campaign") / "part.toml"
+    stated = change(campaign, 'expansion_coefficient = "11.7 ppm/K"', advised.line)
     part = read_test(stated, None).part
     assert 2 * part.A_um.u == pytest.approx(advised.sharper_um, rel=1e-6)
-    assert part.A_um.value == read_results(folder).iso230.A_um.value
+    assert part.A_um.value == ran.A_um.value
     assert next(row.decision for row in part.tolerances if row.quantity == "A") == advised.decision
 
 

@@ -34,11 +34,6 @@ def inverted_signs(folder: Path) -> None:
     _laser(folder, "deviation_um", lambda table: -table["deviation_um"])
 
 
-def one_gross_reading(folder: Path) -> None:
-    """One reading of a metre."""
-    _laser(folder, "deviation_um", lambda table: table["deviation_um"].where(table.index != 100, 1e6))
-
-
 def new_datum(folder: Path) -> None:
     """The beam was broken before cycle 15."""
     _laser(folder, "deviation_um", lambda table: table["deviation_um"] + 80.0 * (table["cycle"] >= 15))
@@ -80,8 +75,3 @@ def _campaign_file(folder: Path, **changed: str) -> None:
 def axis_the_other_way_round(folder: Path) -> None:
     """The same stretch of the plan with its direction reversed."""
     _campaign_file(folder, origin='["250 mm", "90 mm"]', direction="[1, 0]")
-
-
-def emissivity_of_half(folder: Path) -> None:
-    """An emissivity of 0.5 for a painted table."""
-    _campaign_file(folder, emissivity="0.5")
