@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeAlias, TypeVar, cast
 from threadpoolctl import threadpool_limits
 
 from thermofuse.resources import variables
-from thermofuse.units import UNITS, conform, find_unit
+from thermofuse.units import conform, find_unit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,7 +73,7 @@ def check_dataset(dataset: xr.Dataset, argument: str, *, rotary: bool = False) -
     """
     contract, described, source = _ARGUMENTS[argument]
     if rotary and "deviation" in getattr(dataset, "variables", ()):
-        unit = UNITS.get(find_unit(str(dataset["deviation"].attrs.get("units"))) or "")
+        unit = find_unit(str(dataset["deviation"].attrs.get("units")))
         if unit is not None and unit.kind == "angle":
             described = {name: {"units": unit} for name, unit in _ROTARY.items()}
     needs = {name: dims for name, (dims, *_) in contract.items() if name != "quality_flag"}

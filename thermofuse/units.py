@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 from thermofuse.resources import vocabulary, with_degree_sign
 
@@ -14,35 +15,48 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit: its kind of quantity ("length", ...); value * factor + offset is in mm, deg, degC, hPa or percent."""
+    """A unit: its kind of quantity ("length", ...); value * factor + offset is in mm, deg, degC, hPa, percent, s, ppm/K, mm/min or px."""
 
+    name: str
     kind: str
     factor: float
     offset: float
 
 
-#: Words for shares of a unit of length, as in "0.1 um", and their factors.
-SHARES = [(word, float(share)) for share, words in vocabulary("headings")["shares"].items() for word in words]
-#: Unit as it is written, in lower case -> its meaning.
+#: Units of positions and deviations, as they are stated of a table that names none.
+UnitName = Literal["um", "mm", "m", "nm", "in", "mil", "uin", "deg", "arcmin", "arcsec"]
+_VOCABULARY = vocabulary("units")
+#: Units by their names.
 UNITS = {
-    word: Unit(unit["kind"], unit["factor"], unit["offset"])
-    for unit in vocabulary("headings")["units"]
-    for word in unit["words"]
+    one["name"]: Unit(one["name"], one["kind"], one.get("factor", 1.0), one.get("offset", 0.0))
+    for one in _VOCABULARY["units"]
 }
-UNITS |= {
-    f"{share}{gap}{word}": Unit(unit.kind, factor * unit.factor, 0.0)
-    for word, unit in UNITS.items()
-    for share, factor in SHARES
-    for gap in ("", " ")
-    if unit.kind == "length"
+#: Other units, and what loggers write in a row of units for their own columns.
+OF_LOGGERS = frozenset(_VOCABULARY["of_loggers"])
+_WRITTEN = UNITS | {text: UNITS[one["name"]] for one in _VOCABULARY["units"] for text in one.get("written", ())}
+#: In any case; a single letter is another unit in the other one.
+_WORDS = {
+    text.casefold(): UNITS[one["name"]]
+    for one in _VOCABULARY["units"]
+    for text in (one["name"], *one.get("words", ()))
+    if len(text) > 1 or not text.isascii() or not text.isalpha()
 }
+#: A power of ten before a unit, whose share the numbers count: "0.1 um", "1/10 um", "1e-3 mm", "10^-3 mm".
+SHARE = re.compile(r"(?:1/1(?P<over>0+)|0?[.,](?P<zeros>0*)1|(?:1e|10\^?)-(?P<power>\d))\s*(?=[^\s\d])", re.IGNORECASE)
 
 
-def find_unit(text: str) -> str | None:
-    """Return the key of a unit as it is written, None where it is none."""
+def find_unit(text: str) -> Unit | None:
+    """Return the unit that a text names, or the share of one; None where it is none."""
     # Two signs are used for micro: the Greek letter and the micro sign.
-    cleaned = with_degree_sign(text).casefold().replace("μ", "µ").replace("’’", "''")
-    return cleaned if cleaned in UNITS else None
+    written = with_degree_sign(text).replace("μ", "µ")
+    if (share := SHARE.match(written)) and (whole := find_unit(written[share.end() :])):
+        tens = int(share["power"] or len(share["over"] or "") or len(share["zeros"] or "") + 1)
+        part = Unit("", whole.kind, whole.factor / 10.0**tens, whole.offset)
+        alike = (unit for unit in UNITS.values() if replace(unit, name="") == part)
+        return next(alike, replace(part, name=f"{share[0].strip()} {whole.name}"))
+    if written in OF_LOGGERS and written not in _WRITTEN:
+        return None
+    return _WRITTEN.get(written) or _WORDS.get(written.casefold())
 
 
 def conform(
@@ -74,7 +88,7 @@ def conform(
         wanted, given = (one.get("units") for one in (described[variable], dataset[variable].attrs))
         if not wanted or given is None or given == wanted:
             continue
-        old, new = (UNITS.get(find_unit(str(unit)) or "") for unit in (given, wanted))
+        old, new = find_unit(str(given)), find_unit(wanted)
         if old is None or new is None or old.kind != new.kind:
             raise error(
                 f"{name}[{variable!r}] is in {given!r}, which cannot be converted to {wanted!r}; give it in {wanted!r}, or correct its "

@@ -51,6 +51,7 @@ from interferometry.io.tables import (
     where_clock_goes_back,
 )
 from thermofuse.resources import by_word, vocabulary
+from thermofuse.units import SHARE
 
 _VOCABULARY = vocabulary("columns")
 
@@ -592,9 +593,11 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     name, in_heading = name_and_unit(heading)
     if "[" not in heading and not is_unit(in_heading) and (in_heading.isdecimal() or in_heading.isalpha()):
         in_heading = ""  # TC(1), T (air): a number or a word, no unit
-    suffix = read_heading(heading).unit or ""
+    # What the last word of a name means depends on the others: in is an inlet beside a temperature.
     suffixes = _SUFFIXES | _SUFFIXES_OF.get(_word(name)[1], {})
-    ending = suffixes.get(suffix, "")
+    behind = read_heading(name).unit
+    share = behind.name if behind is not None and SHARE.search(name) else ""
+    ending = share or suffixes.get(re.split(r"[\s_/,;]+", name)[-1].casefold().replace("μ", "µ"), "")
     told = "row of units" if unit.strip("- ") else "heading" if in_heading or ending else ""
     unit = unit_name(unit.strip("- ") or in_heading or ending)
     first = _first(series)

@@ -62,6 +62,7 @@ from fusion.campaign.values import (
 from fusion.common import FusionError, TomlError, describe, first_faults, place_in, read_toml, suggest
 from fusion.messages import near_file
 from fusion.results.store import is_text
+from thermofuse.units import UnitName
 
 # Which tables a campaign file needs: any subset of the two instruments, with the plan where temperatures have places;
 # or a record.
@@ -703,6 +704,8 @@ class InterferometryTable(_Measured, title="Laser"):
             "negative": "every run towards smaller positions",
         },
     )
+    position_unit: UnitName | None = key(None, "Unit of the positions", about="of a table that states none")
+    deviation_unit: UnitName | None = key(None, "Unit of the deviations", about="of a table that states none")
     environment: ExistingFile | None = key(
         None, "Log of air and material", example="environment.csv", about="and of what else the drift may follow"
     )

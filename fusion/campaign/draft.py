@@ -21,7 +21,7 @@ from fusion.common import FusionError
 from fusion.results.progress import counted
 from fusion.results.store import is_text, write_text
 from interferometry.common import InterferometryError
-from interferometry.io.readings import DirectionsMissing
+from interferometry.io.readings import NotStated
 from interferometry.io.tables import NO_ZONE
 from thermography.io.other_cameras import read_stack
 from thermography.registration.plan import Fiducial
@@ -377,8 +377,7 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
         yield "# a rotary axis: neither expansion nor dead path enter its angles"
         return
     keys = {one.name.removeprefix("interferometry."): one for one in keys_of("interferometry")}
-    if known.get("directions") == "missing":
-        yield _line(keys["directions"], asker.value(keys["directions"]) or TO_FILL)
+    yield from (_line(keys[key], asker.value(keys[key]) or TO_FILL) for key in known.get("lacking", "").split())
     if not content.of(Kind.ENVIRONMENT):
         yield _line(keys["environment"])
     elif content.frame_files:
@@ -394,8 +393,8 @@ def _attributes(readings: Recognised) -> dict[str, str]:
         deviations = readings.content
         known = {**deviations.attrs, **deviations["time"].attrs, "units": deviations["deviation"].attrs["units"]}
         return {str(name): str(value) for name, value in known.items()}
-    except DirectionsMissing:
-        return {"directions": "missing"}
+    except NotStated as error:
+        return {"lacking": " ".join(error.keys)}
     except InterferometryError:
         return {}
 

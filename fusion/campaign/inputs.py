@@ -395,7 +395,8 @@ def reader_of_deviations(campaign: Campaign) -> Callable[[Path], xr.Dataset]:
     """Return what reads the file of readings as the campaign states it."""
     laser = campaign.interferometry
     stated: dict[str, Any] = {
-        name: getattr(laser, name, None) for name in ("feed_mm_per_min", "dwell_s", "sheet", "directions")
+        name: getattr(laser, name, None)
+        for name in ("feed_mm_per_min", "dwell_s", "sheet", "directions", "position_unit", "deviation_unit")
     }
     return partial(read_deviations, rotary=campaign.thermography is None, **stated)
 

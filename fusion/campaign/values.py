@@ -16,26 +16,15 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from fusion.common import FusionError, suggest
-from thermofuse.resources import by_word, vocabulary, with_degree_sign
-
-_VOCABULARY = vocabulary("units")
+from thermofuse.resources import with_degree_sign
+from thermofuse.units import OF_LOGGERS, UNITS, find_unit
 
 # Values that carry their unit: ``"5 mm"`` to a number in the unit that the calculation uses.
 
-#: Accepted units per canonical unit, as ``(factor, offset)``: canonical = value * factor + offset.
-_UNITS: dict[str, dict[str, tuple[float, float]]] = {
-    target: {unit: (factor, offset) for unit, (factor, offset) in units.items()}
-    for target, units in _VOCABULARY["quantities"].items()
-}
-_SPELLINGS = by_word(_VOCABULARY["spellings"])
-#: Units written out, in any case.
-_WORDS = by_word(_VOCABULARY["words"])
-#: Other units, and what loggers write in a row of units for their own columns.
-_OF_LOGGERS = frozenset(_VOCABULARY["of_loggers"])
 #: Days that are counted from a date: number of 1970-01-01.
-DAY_NUMBERS: Mapping[str, float] = _VOCABULARY["day_numbers"]
+DAY_NUMBERS: Mapping[str, float] = {name: -unit.offset for name, unit in UNITS.items() if unit.kind == "day"}
 #: Units of times that are numbers.
-TIME_UNITS = (*_UNITS["s"], *DAY_NUMBERS)
+TIME_UNITS = (*(name for name, unit in UNITS.items() if unit.kind == "time"), *DAY_NUMBERS)
 _EXAMPLES = {
     "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s",
     "ppm": "0.25 ppm", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min", "px": "4 px",
@@ -51,10 +40,14 @@ _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?
 
 
 _CYCLES = re.compile(r"\s*(\d{1,99})(?:\s*-\s*(\d{1,99}))?\s*")
-#: Heading of a column with its unit, ``"name [unit]"`` or ``"name(unit)"``.
+#: Heading of a column with its unit, ``"name [unit]"`` or ``"name(unit)"``, and as HOBOware has it, ``"name, unit"``.
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 #: The same as ISO 80000 writes it, ``"T1 / °C"``; without spaces of a time alone, as m/s is a unit.
-_QUOTIENT = re.compile(r"\s*(?:(.+?)\s+/\s+|(t|time|zeit)/)(\S.*?)\s*", re.IGNORECASE)
+_QUOTIENT = re.compile(r"\s*(?:(.+?)(?:\s+/\s+|,\s*)|(t|time|zeit)/)(\S.*?)\s*", re.IGNORECASE)
+#: Numbers of logger and sensor that HOBOware writes behind a heading.
+_SERIAL = re.compile(r"\s*\((?:LGR|SEN)[^()]*\)")
+#: A factor beside a name: whether the numbers were multiplied by it or are to be is not known.
+_TIMES = re.compile(r"\s*[\[(]?\s*([x×*·/]\s*10+|(?:[x×*·]\s*)?(?:10\^-?|1[eE]-?)\d+)\s*[\])]?\s*$")
 
 
 class QuantityError(FusionError):
@@ -63,37 +56,45 @@ class QuantityError(FusionError):
 
 def unit_name(text: str) -> str:
     """Return the house spelling of a unit (``"°C"`` -> ``"degC"``), or the text itself where none is known."""
-    text = with_degree_sign(text)
-    return _SPELLINGS.get(text) or _WORDS.get(text.lower(), text)
+    return unit.name if (unit := find_unit(text)) else with_degree_sign(text)
 
 
 def name_and_unit(heading: str) -> tuple[str, str]:
-    """Return name and unit of the heading of a column; the unit is empty where it has none."""
-    if match := _HEADING.fullmatch(heading):
-        return match[1], unit_name(match[2])
-    if (match := _QUOTIENT.fullmatch(heading)) and is_unit(match[3]):
-        return match[1] or match[2], unit_name(match[3])
-    return heading.strip(), ""
+    """Return name and unit of the heading of a column; the unit is empty where it has none, and none that is known where a factor stands
+    beside it.
+
+    >>> name_and_unit("Temp, °F (LGR S/N: 12, SEN S/N: 7)"), name_and_unit("Z x1000 (mm)"), name_and_unit("T / 0.1 °C")
+    (('Temp', 'degF'), ('Z', 'x1000 mm'), ('T', '0.1 degC'))
+    """
+    text = _SERIAL.sub("", heading).strip()
+    name, unit = text, ""
+    if match := _HEADING.fullmatch(text):
+        name, unit = match[1], unit_name(match[2])
+    elif (match := _QUOTIENT.fullmatch(text)) and is_unit(match[3]):
+        name, unit = match[1] or match[2], unit_name(match[3])
+    if (times := _TIMES.search(name)) and times.start():
+        return name[: times.start()], f"{times[1]} {unit}".strip()
+    return name, unit
 
 
 def conversion(unit: str, target: str) -> tuple[float, float]:
     """Return ``(factor, offset)`` that bring values in `unit` to the canonical unit `target`."""
-    known = _UNITS[target]
-    name = unit_name(unit)
-    if name not in known:
-        raise QuantityError(f'"{unit}" is not a unit of {_KINDS[target]}; use one of {", ".join(known)}')
-    return known[name]
+    found, wanted = find_unit(unit), UNITS[target]
+    if found is None or found.kind != wanted.kind:
+        known = ", ".join(name for name, one in UNITS.items() if one.kind == wanted.kind)
+        raise QuantityError(f'"{unit}" is not a unit of {_KINDS[target]}; use one of {known}')
+    return found.factor / wanted.factor, 0.0 if target == "K" else (found.offset - wanted.offset) / wanted.factor
 
 
 def canonical_unit(unit: str) -> str:
     """Return the canonical unit of what a unit measures."""
-    return unit if unit in _UNITS else next(target for target, units in _UNITS.items() if unit in units)
+    return unit if unit in _KINDS else next(name for name in _KINDS if UNITS[name].kind == UNITS[unit].kind)
 
 
 def column_conversion(unit: str, target: str) -> tuple[float, float]:
     """Return ``(factor, offset)`` of a column in `unit`, which may be that of one count: ``"0.0125 mm"``."""
     count = _QUANTITY.fullmatch(unit)
-    if count is not None and unit_name(count[2] or "") in _UNITS[target]:
+    if count is not None and count[2] and (whole := find_unit(count[2])) and whole.kind == UNITS[target].kind:
         factor, offset = conversion(count[2], target)
         return float(count[1]) * factor, offset
     return conversion(unit, target)
@@ -101,8 +102,7 @@ def column_conversion(unit: str, target: str) -> tuple[float, float]:
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit that columns of loggers have."""
-    name = unit_name(text)
-    return any(name in units for units in _UNITS.values()) or name in DAY_NUMBERS or text.strip() in _OF_LOGGERS
+    return find_unit(text) is not None or text.strip() in OF_LOGGERS
 
 
 def role_of_unit(unit: str) -> Literal["temperature", "displacement", "driver"]:

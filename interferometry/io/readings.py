@@ -6,7 +6,7 @@ import itertools
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -53,8 +53,9 @@ from interferometry.io.tables import (
     shown,
     split_unit,
     table_below,
+    unit_of_test,
 )
-from thermofuse.units import UNITS, find_unit
+from thermofuse.units import UNITS, Unit, UnitName
 
 #: Positions closer than this are one, mm or deg.
 POSITION_TOLERANCE = 1e-4
@@ -161,20 +162,40 @@ def turn_by_travel(given: Readings) -> None:
         given.notes.append("forward was taken as the positive direction: the file gives no times that tell the travel")
 
 
-class DirectionsMissing(LaserFormatError):
-    """A table of which neither words nor the order of the positions tell from which side the targets were approached."""
+@dataclass(frozen=True)
+class Stated:
+    """What a campaign file, or a caller, states of a table that does not say it itself: directions of its runs, names of units."""
 
-    def __init__(self, place: str, why: str) -> None:
+    directions: Directions | None = None
+    position_unit: UnitName | None = None
+    deviation_unit: UnitName | None = None
+
+    def unit(self, role: str, of_table: Unit | None, place: str) -> Unit | None:
+        """Return the unit of positions or deviations, as the table or this says it."""
+        stated: UnitName | None = getattr(self, f"{role}_unit")
+        if stated and of_table not in (None, UNITS[stated]):
+            raise LaserFormatError(
+                f"{place}: the table states the unit {of_table.name} of the {role}s; remove {role}_unit"
+            )
+        return UNITS[stated] if stated else of_table
+
+
+_NOTHING = Stated()
+
+
+class NotStated(LaserFormatError):
+    """A table that does not say what the `keys` of a campaign file, and parameters of `read_deviations`, state."""
+
+    def __init__(self, place: str, lacking: Mapping[str, str]) -> None:
+        self.keys = tuple(lacking)
+        remedy = " and ".join(f"{key} as one of {', '.join(map(repr, get_args(_CHOICES[key])))}" for key in lacking)
         super().__init__(
-            f"{place}: {why}; name the direction of each run in the table ('positive', 'negative'), or state directions as one of "
-            f"{', '.join(map(repr, get_args(Directions)))}, under [interferometry] in a campaign file or to read_deviations"
+            f"{place}: {'; '.join(lacking.values())}; write it in the table, or state {remedy}, under [interferometry] in a campaign "
+            "file or to read_deviations"
         )
 
 
-def _state_directions(directions: Directions, runs: int) -> list[str]:
-    """Return the direction of each of so many successive runs."""
-    first = DIRECTIONS.index(directions.split()[0])
-    return [DIRECTIONS[(first + (run if directions.endswith("first") else 0)) % 2] for run in range(runs)]
+_CHOICES = {"directions": Directions, "position_unit": UnitName, "deviation_unit": UnitName}
 
 
 def passes_by_order(positions: Sequence[float], runs: Sequence[int]) -> list[tuple[int, str]] | None:
@@ -351,14 +372,14 @@ _NOT_FROM_ONE = "is not a whole number from 1"
 
 @dataclass(frozen=True)
 class LongTable:
-    """A table with one reading per line whose header, on a line, was understood: column of each role, unit of positions and deviations
-    (keys of `UNITS`), and headings that name nothing known.
+    """A table with one reading per line whose header, on a line, was understood: column of each role, units of positions and deviations,
+    and headings that name nothing known.
     """
 
     grid: Grid
     line: int
     columns: dict[str, int]
-    units: dict[str, str]
+    units: dict[str, Unit]
     width: int
     rows: list[tuple[int, list[str]]]
     ignored: list[str]
@@ -424,16 +445,11 @@ def _understand(grid: Grid, at: int, line: int, headings: list[Heading]) -> Long
         role: heading.unit for heading in headings if (role := heading.role) in ("position", "measured", "deviation")
     }
     if rows and None in units.values() and _is_row_of_units(rows[0][1]):
-        units = {role: unit or find_unit(_cell(rows[0][1], columns.get(role))) for role, unit in units.items()}
+        units = {role: unit or unit_of_test(_cell(rows[0][1], columns.get(role))) for role, unit in units.items()}
         rows = rows[1:]
     for role in ("position", "deviation" if "deviation" in columns else "measured"):
         if units[role] is None:
-            heading = headings[columns[role]]
-            _refuse_unknown_unit(grid, line, heading)
-            raise LaserFormatError(
-                f"{grid.place}, line {line}: the column {heading.text!r} has no unit; write it in the heading, for example "
-                f'"{heading.text} [{"um" if role == "deviation" else "mm"}]"'
-            )
+            _refuse_unknown_unit(grid, line, headings[columns[role]])
     if "deviation" in columns and units.get("measured") is None:
         columns.pop("measured", None)
     if "direction" in columns:
@@ -470,7 +486,7 @@ def _with_words(rows: list[tuple[int, list[str]]], column: int) -> list[tuple[in
 
 def _is_row_of_units(fields: list[str]) -> bool:
     texts = [text.strip("[]() ") for text in fields if text]
-    return bool(texts) and all(find_unit(text) is not None for text in texts)
+    return bool(texts) and all(unit_of_test(text) is not None for text in texts)
 
 
 def _cell(fields: Sequence[str], index: int | None) -> str:
@@ -479,64 +495,118 @@ def _cell(fields: Sequence[str], index: int | None) -> str:
 
 @dataclass(frozen=True)
 class _Label:
-    """Where a line belongs, with numbers as they stand in the file."""
+    """A value, where it belongs, with numbers as they stand in the file, its own unit, and what stands beside it."""
 
     line: int
-    fields: list[str]
     number: int
     direction: str
     signed: bool
     target: int
     position: float
+    value: str
+    unit: Unit | None = None
+    measured: str = ""
+    time: str = ""
 
 
-def read_long_table(table: LongTable, directions: Directions | None = None) -> Readings:
-    """Read the lines of a table, with the directions of its runs where it names none."""
-    path, numerals, columns = table.grid.path, table.grid.numerals, table.columns
-    stated = ", ".join(f"{role} in {unit}" for role, unit in table.units.items())
-    kind = _kind_of(table.units.values(), f"{table.grid.place}, line {table.line}: {stated}")
-    given = Readings(path, kind, ignored=table.ignored)
-    role = "deviation" if "deviation" in columns else "measured"
-    unit = UNITS[table.units[role]]
-    labels: list[_Label] = []
+@dataclass(frozen=True)
+class _Labelled:
+    """Values of a table, and units of their positions, of themselves and of measured positions beside them, None where it has none.
+
+    ``of_positions``: the values are measured positions by their heading; ``in_order``: the lines may follow each other as they were
+    measured; ``numbered``, ``cycles``: the table numbers runs, or cycles.
+    """
+
+    grid: Grid
+    line: int
+    given: Readings
+    labels: list[_Label]
+    position: Unit | None
+    value: Unit | None
+    measured: Unit | None = None
+    of_positions: bool = False
+    in_order: bool = False
+    timed: bool = False
+    numbered: bool = True
+    cycles: bool = False
+
+    @property
+    def place(self) -> str:
+        """File and line of the heading."""
+        return f"{self.grid.place}, line {self.line}"
+
+
+def read_long_table(table: LongTable, stated: Stated = _NOTHING) -> Readings:
+    """Read the lines of a table with one reading in each."""
+    columns, units = table.columns, table.units
+    given, labels = Readings(table.grid.path, ignored=table.ignored), list[_Label]()
     for line, fields in table.rows:
         with given.left_out.collect(line):
-            labels.append(_label(table, line, fields, numerals))
-    order = DateOrder.of(path, [(label.line, _time_text(table, label.fields)) for label in labels])
-    if labels and "direction" not in columns:
-        labels = _with_directions(table, labels, order, directions, given.notes)
-    elif directions is not None and "direction" in columns:
-        raise _named_already(table.grid)
-    labels = _renumber(table, labels, given)
+            labels.append(_label(table, line, fields))
+    of_positions = "deviation" not in columns
+    return _read_labels(
+        _Labelled(
+            table.grid, table.line, given, labels, units.get("position"), units.get("measured" if of_positions else "deviation"),
+            measured=None if of_positions else units.get("measured"), of_positions=of_positions, in_order=True, timed="time" in columns,
+            numbered=bool({"cycle", "run"} & columns.keys()), cycles="cycle" in columns,
+        ),
+        stated,
+    )  # fmt: skip
+
+
+def _read_labels(table: _Labelled, stated: Stated) -> Readings:
+    """Return the readings of a table: directions and units as it names them, as its values tell or as they are stated, numbers from 1."""
+    given, numerals, labels = table.given, table.grid.numerals, table.labels
+    if not labels:
+        return given
+    order = DateOrder.of(given.path, [(label.line, label.time) for label in labels] if table.timed else [])
+    position = stated.unit("position", table.position, table.place)
+    value = stated.unit("deviation", table.value, table.place)
+    numbers = np.array([numerals.number(one.value) if _is_number(one.value, numerals) else np.nan for one in labels])
+    ratio = value.factor / position.factor if value and position else 1.0
+    places = np.array([label.position for label in labels])
+    near = np.abs(ratio * numbers - places) < _NEAR * np.ptp(places)
+    of_positions = table.of_positions or bool(near[np.isfinite(numbers)].all() and near.any())
+    value = value or (position if of_positions else None)
+    lacking = {}
+    if position is None:
+        lacking["position_unit"] = "no heading states the unit of the positions"
+    if value is None:
+        largest = f", the largest of which is {np.nanmax(np.abs(numbers), initial=0.0):g}"
+        lacking["deviation_unit"] = f"no heading states the unit of the deviations{largest}"
+    if position is not None:
+        labels = [replace(label, position=label.position * position.factor) for label in labels]
+    if isinstance(directed := _with_directions(table, labels, order, stated.directions), str):
+        lacking["directions"] = directed
+    if lacking or position is None or value is None or isinstance(directed, str):
+        raise NotStated(table.place, lacking)
+    units = {value, *(label.unit for label in labels if label.unit)}
+    told = f"positions in {position.name}, deviations in {', '.join(sorted(unit.name for unit in units))}"
+    given.kind = _kind_of([*units, position], f"{table.place}: {told}")
+    if of_positions and not table.of_positions:
+        given.notes.append("the values are measured positions: the target positions were subtracted")
     measured: list[float] = []
-    for label in labels:
+    for label in _renumber(table, directed):
         cell = label.number, label.direction, label.target
         with given.collect(label.line, cell):
-            time: np.datetime64 = np.datetime64("NaT", "ns")
-            zone = None
-            if "time" in columns:
-                time, zone = parse_time(_time_text(table, label.fields), order)
-            value = numerals.reading(label.fields[columns[role]]) * unit.factor
-            if role == "measured":
-                value -= label.position
-            elif "measured" in columns:
-                measured.append(_measured(table, label, numerals) - label.position)
+            time, zone = parse_time(label.time, order) if table.timed else (np.datetime64("NaT", "ns"), None)
+            reading = numerals.reading(label.value) * (label.unit or value).factor
+            if of_positions:
+                reading -= label.position
+            elif table.measured is not None:
+                known = _is_number(label.measured, numerals)
+                beside = numerals.number(label.measured) * table.measured.factor if known else np.nan
+                measured.append(beside - label.position)
             if zone is not None:
                 given.zones.setdefault(zone, label.line)
             # Rounded to a thousandth of a nanometre: the factors of the units have no exact binary value.
-            deviation = round(value * FINE[unit.kind], 6)
+            deviation = round(reading * FINE[given.kind], 6)
             given.readings.append(Reading(label.line, *cell, label.position, time, deviation))
     given.left_out.lines.sort(key=lambda each: each.line)
     if not all(label.signed for label in labels):
         turn_by_travel(given)
-    _compare_signs(given, np.array(measured) * FINE[unit.kind])
+    _compare_signs(given, np.array(measured) * FINE[given.kind])
     return given
-
-
-def _measured(table: LongTable, label: _Label, numerals: Numerals) -> float:
-    """Return the measured position of a line that has a deviation too, NaN where it has none."""
-    text = label.fields[table.columns["measured"]]
-    return numerals.number(text) * UNITS[table.units["measured"]].factor if _is_number(text, numerals) else np.nan
 
 
 def _compare_signs(given: Readings, differences: np.ndarray) -> None:
@@ -560,40 +630,62 @@ def _compare_signs(given: Readings, differences: np.ndarray) -> None:
         )
 
 
-def _named_already(grid: Grid) -> LaserFormatError:
-    return LaserFormatError(f"{grid.place}: the table names the direction of its runs; remove directions")
-
-
 def _with_directions(
-    table: LongTable, labels: list[_Label], order: DateOrder, directions: Directions | None, notes: list[str]
-) -> list[_Label]:
-    """Return the labels of a table without a known direction with theirs: as stated, else by the order of the positions in time."""
-    with suppress(BadReading):
-        times = [parse_time(_time_text(table, label.fields), order)[0] for label in labels]
-        labels = [labels[at] for at in np.argsort(times, kind="stable")]
-    positions, runs = [label.position for label in labels], [label.number for label in labels]
-    passes = passes_by_order(positions, runs)
-    repeated = len({*zip(runs, number_targets(positions), strict=True)}) < len(labels)
-    if passes is None and (directions is None or repeated):
-        raise DirectionsMissing(
-            f"{table.grid.place}, line {table.line}",
-            "no column names a direction, and the order of the positions does not tell it",
+    table: _Labelled, labels: list[_Label], order: DateOrder, directions: Directions | None
+) -> list[_Label] | str:
+    """Return labels with their directions: as the table names them, as the order of the positions in time tells, or as stated; why none of
+    these is known.
+    """
+    if table.timed:
+        with suppress(BadReading):
+            times = [parse_time(label.time, order)[0] for label in labels]
+            labels = [labels[at] for at in np.argsort(times, kind="stable")]
+    runs = [(label.number, label.direction) for label in labels]
+    named = all(label.direction for label in labels)
+    if named and not (table.in_order and _contradicts(labels)):
+        if directions is not None:
+            raise LaserFormatError(f"{table.place}: the table names the direction of its runs; remove directions")
+        return labels
+    positions = [label.position for label in labels]
+    passes = None if named else passes_by_order(positions, [number for number, _ in runs])
+    if passes is not None:
+        table.given.notes.append("the direction of each run follows from the order of its positions")
+        there = Counter(number for number, _ in {*zip((number for number, _ in runs), passes, strict=True)})
+        numbered = table.numbered and max(there.values()) <= 2
+        return [
+            replace(label, number=label.number if numbered else number, direction=direction)
+            for label, (number, direction) in zip(labels, passes, strict=True)
+        ]
+    if directions is None or len({*zip(runs, number_targets(positions), strict=True)}) < len(labels):
+        return (
+            "the runs named negative lead to larger positions and the others to smaller ones, against the sign of the travel"
+            if named
+            else "no heading or column names the direction of the runs, and the order of the positions does not tell it"
         )
-    if passes is None and directions is not None:
-        numbers = list(dict.fromkeys(runs))
-        of_run = dict(zip(numbers, _state_directions(directions, len(numbers)), strict=True))
-        return [replace(label, direction=of_run[label.number]) for label in labels]
-    notes.append(_BY_ORDER)
-    numbered = {"cycle", "run"} & table.columns.keys()
-    return [
-        replace(label, number=label.number if numbered else number, direction=direction)
-        for label, (number, direction) in zip(labels, passes or [], strict=True)
+    of_run = dict(zip(dict.fromkeys(runs), _state_directions(directions, len({*runs})), strict=True))
+    return [replace(label, direction=of_run[run]) for label, run in zip(labels, runs, strict=True)]
+
+
+def _contradicts(labels: Sequence[_Label]) -> bool:
+    """Whether every run goes against the sign of the direction that it is given, in the order of the lines."""
+    runs = [[*run] for _, run in itertools.groupby(labels, lambda one: (one.number, one.direction))]
+    ways = [
+        (run[-1].position - run[0].position) * (1 if run[0].direction == DIRECTIONS[0] else -1)
+        for run in runs
+        if run[0].signed and len(run) > 1
     ]
+    return bool(ways) and max(ways) < 0
 
 
-def _kind_of(units: Iterable[str], given: str) -> Kind:
+def _state_directions(directions: Directions, runs: int) -> list[str]:
+    """Return the direction of each of so many successive runs."""
+    first = DIRECTIONS.index(directions.split()[0])
+    return [DIRECTIONS[(first + (run if directions.endswith("first") else 0)) % 2] for run in range(runs)]
+
+
+def _kind_of(units: Iterable[Unit], given: str) -> Kind:
     """Return whether the units are those of a linear or of a rotary axis."""
-    kinds = {UNITS[unit].kind for unit in units}
+    kinds = {unit.kind for unit in units}
     if kinds == {"angle"}:
         return "angle"
     if kinds == {"length"}:
@@ -601,8 +693,8 @@ def _kind_of(units: Iterable[str], given: str) -> Kind:
     raise LaserFormatError(f"{given}; give both as lengths (linear axis) or both as angles (rotary axis)")
 
 
-def _label(table: LongTable, line: int, fields: list[str], numerals: Numerals) -> _Label:
-    columns = table.columns
+def _label(table: LongTable, line: int, fields: list[str]) -> _Label:
+    columns, numerals = table.columns, table.grid.numerals
     if len(fields) <= max(columns.values()) or any(fields[table.width :]):
         raise BadReading("", f"does not have {table.width} fields")
     direction: tuple[str, bool] | None = ("", True)
@@ -613,8 +705,20 @@ def _label(table: LongTable, line: int, fields: list[str], numerals: Numerals) -
     numbers = next((columns[role] for role in ("cycle", "run") if role in columns), None)
     number = 0 if numbers is None else _count(fields[numbers], numerals)
     target = _count(fields[columns["target"]], numerals) if "target" in columns else 0
-    position = numerals.reading(fields[columns["position"]]) * UNITS[table.units["position"]].factor
-    return _Label(line, fields, number, *direction, target, position)
+    position, value, measured = (
+        fields[columns.get(role, columns.get("measured", -1))] for role in ("position", "deviation", "measured")
+    )
+    where = numerals.reading(position)
+    return _Label(
+        line,
+        number,
+        *direction,
+        target,
+        where,
+        value if "deviation" in columns else measured,
+        measured=measured,
+        time=_time_text(table, fields),
+    )
 
 
 def _count(text: str, numerals: Numerals) -> int:
@@ -626,12 +730,13 @@ def _count(text: str, numerals: Numerals) -> int:
     return int(value)
 
 
-def _renumber(table: LongTable, labels: list[_Label], given: Readings) -> list[_Label]:
+def _renumber(table: _Labelled, labels: list[_Label]) -> list[_Label]:
     """Return the labels with cycles and targets numbered from 1."""
-    if "cycle" not in table.columns:
+    given = table.given
+    if not table.cycles:
         labels = _cycles_of_runs(labels)
     numbers = _from_one([label.number for label in labels], "cycles", given.notes)
-    if "target" in table.columns:
+    if any(label.target for label in labels):
         targets = _from_one([label.target for label in labels], "targets", given.notes)
     else:
         targets = number_targets([label.position for label in labels])
@@ -684,8 +789,6 @@ _ROWS_ABOVE, _ROWS_BELOW = 2, 3
 _FEWEST_TARGETS = 2
 #: Values closer to their targets than this share of the travel are measured positions.
 _NEAR = 0.02
-#: Largest deviation, um, of a test whose unit nobody states: beyond, it may be mm or nm.
-_PLAUSIBLE_UM = (0.5, 200.0)
 #: Words beside the number of a run: axis and "number".
 _BESIDE_NUMBERS = ("no", "nr", "x", "y", "z", "u", "w", "c")
 #: More than any table of positions by run has; rows are given the width of the widest one, which must not fill the memory.
@@ -695,28 +798,28 @@ _MOST_CELLS = 5_000_000
 @dataclass(frozen=True)
 class Run:
     """A column (or row) of deviations: its headings joined, number of the run or cycle, direction ("" where nothing names it), whether the
-    word for it names the sign of the travel, unit (a key of `UNITS`), and line and text of each reading in the order of the positions.
+    word for it names the sign of the travel, unit, and line and text of each reading in the order of the positions.
     """
 
     text: str
     number: int | None
     direction: str
     signed: bool
-    unit: str | None
+    unit: Unit | None
     values: list[tuple[int, str]]
 
 
 @dataclass
 class WideTable:
     """A table of position by run whose headings were understood: line of the row that names the positions, line and text of each position,
-    units (keys of `UNITS`), runs, and headings of columns that are none.
+    units, runs, and headings of columns that are none.
     """
 
     grid: Grid
     line: int
     positions: list[tuple[int, str]]
-    position_unit: str | None
-    deviation_unit: str | None
+    position_unit: Unit | None
+    deviation_unit: Unit | None
     runs: list[Run]
     ignored: list[str] = field(default_factory=list)
 
@@ -814,7 +917,7 @@ def _positions_below(
     ]
     runs, ignored = _read_runs(grid, [one for one in candidates if one[0] or any(text for _, text in one[1])])
     titles = [text for row in cells[:first] for text in row]
-    unit = heading.unit or find_unit(cells[first - 1][column].strip("[]() "))
+    unit = heading.unit or unit_of_test(cells[first - 1][column])
     positions = [(lines[i], cells[i][column]) for i in data]
     return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored) if runs else None
 
@@ -859,11 +962,11 @@ def _names_runs(texts: Sequence[str]) -> bool:
     return len(set(named)) > 1 and all(_wide_label(text) is not None for text in named)
 
 
-def _wide_label(text: str) -> tuple[int | None, tuple[str, bool] | None, str | None] | None:
+def _wide_label(text: str) -> tuple[int | None, tuple[str, bool] | None, Unit | None] | None:
     """Return number, direction (a letter, where it has one) and unit that a heading of a run holds; None where it holds anything else."""
     name, unit = split_unit(text)
-    if unit is None and find_unit(text.strip("[]() ")) is not None:
-        return None, None, find_unit(text.strip("[]() "))
+    if unit is None and unit_of_test(text) is not None:
+        return None, None, unit_of_test(text)
     numbers = set(re.findall(r"\d+", name))
     if len(numbers) > 1:
         return None
@@ -919,11 +1022,11 @@ def _read_runs(
     return runs, [text for (text, _), keep in zip(read, kept, strict=True) if not keep]
 
 
-def _deviation_unit(titles: Sequence[str]) -> str | None:
+def _deviation_unit(titles: Sequence[str]) -> Unit | None:
     """Return the unit that a title such as "Deviations [µm]" or "Unit: µm" gives."""
     for i, text in enumerate(titles):
         name, unit = split_unit(re.sub(r"\s*[:=]\s*", " ", text))
-        following = find_unit(titles[i + 1].strip("[]() ")) if i + 1 < len(titles) else None
+        following = unit_of_test(titles[i + 1]) if i + 1 < len(titles) else None
         if fold(name) in UNIT_WORDS and (unit or following):
             return unit or following
         if unit and any(read_heading(part).role == "deviation" for part in name.split("\\")):
@@ -931,105 +1034,23 @@ def _deviation_unit(titles: Sequence[str]) -> str | None:
     return None
 
 
-def _position_unit(titles: Sequence[str]) -> str | None:
+def _position_unit(titles: Sequence[str]) -> Unit | None:
     r"""Return the unit that a title or corner such as "Run \ Position [mm]" gives."""
     parts = [read_heading(part.strip()) for text in titles for part in text.split("\\")]
     return next((heading.unit for heading in parts if heading.role == "position" and heading.unit), None)
 
 
-def read_wide_table(table: WideTable, directions: Directions | None = None) -> Readings:
-    """Read the readings of a table of position by run, with the directions of its runs where it names none."""
-    path, numerals = table.grid.path, table.grid.numerals
-    notes: list[str] = []
-    kind, position_unit, fine_unit = _wide_units(table, notes)
-    given = Readings(path, kind, ignored=table.ignored, notes=notes)
-    factor = UNITS[position_unit].factor
-    positions = [numerals.number(text) * factor for _, text in table.positions]
-    targets = number_targets(positions)
-    table = replace(table, runs=_directed_runs(table, positions, directions, notes))
-    for run, cycle in zip(table.runs, _cycles(table), strict=True):
-        fine = UNITS[run.unit or fine_unit].factor * FINE[kind]
-        for (line, text), target, position in zip(run.values, targets, positions, strict=True):
-            if not text:
-                continue
-            cell = cycle, run.direction, target
-            with given.collect(line, cell):
-                deviation = round(numerals.reading(text) * fine, 6)
-                given.readings.append(Reading(line, *cell, position, np.datetime64("NaT", "ns"), deviation))
-    if not all(run.signed for run in table.runs):
-        turn_by_travel(given)
-    _judge_values(given, table, position_unit)
-    return given
-
-
-def _judge_values(given: Readings, table: WideTable, position_unit: str) -> None:
-    """Subtract the targets where the values are measured positions; note the unit that values without one were given, unless they show
-    that it is none of theirs.
-    """
-    unstated = _stated_unit(table) is None
-    fine = FINE[given.kind]
-    values = np.array([one.deviation for one in given.readings]) * (
-        UNITS[position_unit].factor if unstated else 1 / fine
-    )
-    positions = np.array([one.position for one in given.readings])
-    largest = float(np.abs(values).max(initial=0.0))
-    if len(positions) and np.abs(values - positions).max() < _NEAR * np.ptp(positions):
-        differences = np.round((values - positions) * fine, 6)
-        given.readings = [
-            replace(one, deviation=float(value)) for one, value in zip(given.readings, differences, strict=True)
-        ]
-        given.notes.append("the values are measured positions: the target positions were subtracted")
-    elif unstated and given.kind == "length" and not _PLAUSIBLE_UM[0] <= largest <= _PLAUSIBLE_UM[1]:
-        raise LaserFormatError(
-            f"{table.grid.place}, line {table.line}: no heading states the unit of the deviations, whose largest is {largest:g}; write it "
-            'above the table ("Unit: um") or in the headings ("1+ [um]")'
+def read_wide_table(table: WideTable, stated: Stated) -> Readings:
+    """Read the values of a table of position by run."""
+    numerals = table.grid.numerals
+    deviation = table.deviation_unit or next((run.unit for run in table.runs if run.unit), None)
+    lacking = {
+        role
+        for role, unit, of_key in (
+            ("deviation", deviation, stated.deviation_unit), ("position", table.position_unit, stated.position_unit)
         )
-    elif unstated:
-        unit = "um" if given.kind == "length" else "arcsec"
-        given.notes.append(f"warning: no heading states the unit of the deviations: taken as {unit}")
-
-
-def _stated_unit(table: WideTable) -> str | None:
-    return table.deviation_unit or next((run.unit for run in table.runs if run.unit), None)
-
-
-def _directed_runs(
-    table: WideTable, positions: Sequence[float], directions: Directions | None, notes: list[str]
-) -> list[Run]:
-    """Return the runs with their directions: as the table names them, as the order of the positions tells, or as stated."""
-    if all(run.direction for run in table.runs):
-        if directions is not None:
-            raise _named_already(table.grid)
-        return table.runs
-    passes = passes_by_order(positions, [0] * len(positions))
-    if passes is not None:
-        notes.append(_BY_ORDER)
-        there_and_back = max(number for number, _ in passes) == 2
-        return [
-            replace(
-                run,
-                number=run.number if there_and_back else None,
-                direction=direction,
-                values=[
-                    (line, text if at == one else "") for (line, text), (at, _) in zip(run.values, passes, strict=True)
-                ],
-            )
-            for run in table.runs
-            for one, direction in dict(passes).items()
-        ]
-    if directions is None or len(set(number_targets(positions))) < len(positions):
-        raise DirectionsMissing(
-            f"{table.grid.place}, line {table.line}",
-            f"the runs {table.runs[0].text!r} to {table.runs[-1].text!r} name no direction",
-        )
-    stated = _state_directions(directions, len(table.runs))
-    return [replace(run, number=None, direction=one) for run, one in zip(table.runs, stated, strict=True)]
-
-
-def _wide_units(table: WideTable, notes: list[str]) -> tuple[Kind, str, str]:
-    """Return the kind of axis, the unit of the positions, and that of runs without one; what no heading states is noted as taken."""
-    stated = _stated_unit(table)
-    lacking = {role for role, unit in (("deviation", stated), ("position", table.position_unit)) if unit is None}
+        if unit is None and of_key is None
+    }  # fmt: skip
     for line, fields in table.grid.rows:
         for text, following in itertools.pairwise([*fields, ""] if line <= table.line + _ROWS_BELOW else ()):
             word, _, rest = re.sub(r"\s*[:=]\s*", " ", text).partition(" ")
@@ -1038,30 +1059,26 @@ def _wide_units(table: WideTable, notes: list[str]) -> tuple[Kind, str, str]:
             )
             if heading.role in lacking:
                 _refuse_unknown_unit(table.grid, line, heading)
-    known = table.position_unit or stated
-    usual = ("deg", "arcsec") if known and UNITS[known].kind == "angle" else ("mm", "um")
-    position, deviation = table.position_unit or usual[0], stated or usual[1]
-    if table.position_unit is None:
-        notes.append(f"warning: no heading states the unit of the positions: taken as {position}")
-    units = sorted({run.unit or deviation for run in table.runs})
-    told = f"positions in {position}, deviations in {', '.join(units)}"
-    return _kind_of([*units, position], f"{table.grid.place}, line {table.line}: {told}"), position, deviation
-
-
-def _cycles(table: WideTable) -> list[int]:
-    """Return the cycle of each run: its number, or its place among the runs of its direction."""
     numbers = [run.number for run in table.runs]
-    if any(number is None for number in numbers) and any(number is not None for number in numbers):
+    numbered = None not in numbers
+    if not numbered and any(number is not None for number in numbers):
         unnumbered = next(run.text for run in table.runs if run.number is None)
         raise LaserFormatError(
             f"{table.grid.place}, line {table.line}: {unnumbered!r} has no number, but other runs have; number every run"
         )
-    up, down = ({run.number for run in table.runs if run.direction == direction} for direction in DIRECTIONS)
-    if None in numbers or (up and down and not up & down):
-        counts = {direction: itertools.count(1) for direction in DIRECTIONS}
-        return [next(counts[run.direction]) for run in table.runs]
-    first = min(number for number in numbers if number is not None)
-    return [number + (1 if first == 0 else 0) for number in numbers if number is not None]
+    labels = [
+        _Label(line, number if run.number is None else run.number, run.direction, run.signed, 0, numerals.number(place), text, run.unit)
+        for number, run in enumerate(table.runs, start=1)
+        for (line, text), (_, place) in zip(run.values, table.positions, strict=True)
+        if text
+    ]  # fmt: skip
+    return _read_labels(
+        _Labelled(
+            table.grid, table.line, Readings(table.grid.path, ignored=table.ignored), labels, table.position_unit, deviation,
+            numbered=numbered, cycles=numbered and {run.direction for run in table.runs} in ({"positive"}, {"negative"}),
+        ),
+        stated,
+    )  # fmt: skip
 
 
 # Readers of deviations and environment: the kind of file is recognised, and every unusable line is listed in the
@@ -1071,7 +1088,7 @@ def _cycles(table: WideTable) -> list[int]:
 class Layout(NamedTuple):
     """A layout of deviations: its row in docs/formats.md, what finds it in the first bytes of a file or in a grid, and what reads it.
 
-    A file is read by its path and what was stated of feed (mm/min) and dwell (s), a table by what was found and the stated directions.
+    A file is read by its path and what was stated of feed (mm/min) and dwell (s), a table by what was found and what was stated of it.
     """
 
     name: str
@@ -1103,7 +1120,7 @@ _WITH_UNIT = re.compile(r"\s*([^\W\d_][^/\[\]()]{0,99}?)\s*[\[(]\s*([^\[\]()]+?)
 ENVIRONMENT_COLUMNS = (
     ("air_temperature_degC", "air_temperature", "temperature", -9.0, 60.0),
     ("air_pressure_hPa", "air_pressure", "pressure", 500.0, 1200.0),
-    ("relative_humidity_percent", "relative_humidity", "humidity", 1.0, 100.0),
+    ("relative_humidity_percent", "relative_humidity", "share", 1.0, 100.0),
     ("material_temperature_degC", "material_temperature", "temperature", -9.0, 80.0),
 )
 AIR_AND_MATERIAL = tuple(name for _, name, *_ in ENVIRONMENT_COLUMNS)
@@ -1116,6 +1133,8 @@ def read_deviations(
     dwell_s: float | None = None,
     sheet: str | None = None,
     directions: Directions | None = None,
+    position_unit: UnitName | None = None,
+    deviation_unit: UnitName | None = None,
     rotary: bool = False,
 ) -> xr.Dataset:
     r"""Read positioning deviations from a file.
@@ -1138,6 +1157,8 @@ def read_deviations(
     directions : {"positive first", "negative first", "positive", "negative"}, optional
         From which side the targets were approached, of a table that names no direction and whose order of positions does not tell it: in
         alternating runs, of which the first is named, or always from the same side.
+    position_unit, deviation_unit : {"um", "mm", "m", "nm", "in", "mil", "uin", "deg", "arcmin", "arcsec"}, optional
+        Unit of the positions, and of the deviations, of a table that states none.
     rotary : bool, optional
         Whether a rotary axis is accepted: its positions are in deg and its deviations in arcsec, as the units of the variables say.
 
@@ -1153,8 +1174,8 @@ def read_deviations(
     Raises
     ------
     LaserFormatError
-        The file cannot be used as a whole, it is of a rotary axis and `rotary` is False, or `directions` is needed and not given, or given
-        and not needed.
+        The file cannot be used as a whole, it is of a rotary axis and `rotary` is False, or what it does not say, `directions` or a unit,
+        is not given, or given though it says it.
     OSError
         The file cannot be opened (FileNotFoundError where there is none); its ``filename`` names it.
 
@@ -1175,8 +1196,10 @@ def read_deviations(
     [[0.12, 1.48]]
     """
     path = Path(path)
-    if directions not in (None, *get_args(Directions)):
-        raise LaserFormatError(f"directions={directions!r} is none of {', '.join(map(repr, get_args(Directions)))}")
+    stated = Stated(directions, position_unit, deviation_unit)
+    for name, choices in _CHOICES.items():
+        if (given := getattr(stated, name)) not in (None, *get_args(choices)):
+            raise LaserFormatError(f"{name}={given!r} is none of {', '.join(map(repr, get_args(choices)))}")
     start = _start_of(path)
     if (program := _of_a_program(start)) is not None:
         return program.read(path, feed_mm_per_min, dwell_s)
@@ -1184,7 +1207,7 @@ def read_deviations(
         raise LaserFormatError(
             f"{path}: a report of averages over runs holds no single reading; export the readings of every run"
         )
-    deviations = _read_table_of_deviations(path, sheet, directions)
+    deviations = _read_table_of_deviations(path, sheet, stated)
     if deviations["deviation"].attrs["units"] != "um" and not rotary:
         raise LaserFormatError(
             f"{path}: the positions are angles; a rotary axis is evaluated by ISO 230-2 alone, without a camera and not while it is "
@@ -1204,7 +1227,7 @@ def _of_a_program(start: bytes) -> Layout | None:
     return next((one for one in FILES if one.find(start)), None)
 
 
-def _read_table_of_deviations(path: Path, sheet: str | None, directions: Directions | None) -> xr.Dataset:
+def _read_table_of_deviations(path: Path, sheet: str | None, stated: Stated) -> xr.Dataset:
     """Read delimited text or a spreadsheet: one reading per line, or position by run."""
     grids = read_grids(path, sheet=sheet)
     found: dict[str, tuple[Layout, Any]] = {}
@@ -1228,7 +1251,7 @@ def _read_table_of_deviations(path: Path, sheet: str | None, directions: Directi
             f"columns {','.join(DEVIATION_COLUMNS)}, or a table of position by run such as 'Position [mm],1+ [um],1- [um],2+ [um]'"
         )
     layout, table = next(iter(found.values()))
-    return check_and_assemble(layout.read(table, directions))
+    return check_and_assemble(layout.read(table, stated))
 
 
 def holds_deviations(path: Path) -> bool:
@@ -1297,7 +1320,7 @@ def read_environment(path: str | Path) -> xr.Dataset:
     def parse(fields: dict[str, str]) -> list[float]:
         values = []
         for (column, _, _, low, high), (text, unit) in zip(ENVIRONMENT_COLUMNS, columns.values(), strict=True):
-            value = table.numerals.reading(fields[text]) * UNITS[unit].factor + UNITS[unit].offset
+            value = table.numerals.reading(fields[text]) * unit.factor + unit.offset
             if not low <= value <= high:
                 raise BadReading(fields[text], f"is outside {low:g} .. {high:g}, the range of {column} in its unit")
             values.append(value)
@@ -1325,7 +1348,7 @@ def _number_or_nan(table: DelimitedTable, text: str) -> float:
         return np.nan
 
 
-def _environment_table(path: Path) -> tuple[DelimitedTable, str, dict[str, tuple[str, str]]]:
+def _environment_table(path: Path) -> tuple[DelimitedTable, str, dict[str, tuple[str, Unit]]]:
     """Return the table of a log, the column of times, and heading and unit of each variable."""
     best: tuple[int, str] = (-99, "")
     for grid in read_grids(path):
@@ -1340,12 +1363,12 @@ def _environment_table(path: Path) -> tuple[DelimitedTable, str, dict[str, tuple
                 found = f"line {line} lacks {', '.join(lacking)}"
                 best = max(best, (-len(lacking), found), key=lambda each: each[0])
                 continue
+            named = {name: (heading.text, heading.unit) for name, heading in columns.items() if heading.unit}
             for _, name, kind, *_ in ENVIRONMENT_COLUMNS:
-                if UNITS[columns[name].unit or ""].kind != kind:
+                if named[name][1].kind != kind:
                     raise LaserFormatError(
-                        f"{path}, line {line}: the unit of {columns[name].text!r} is none of a {kind}; correct the heading"
+                        f"{path}, line {line}: the unit of {named[name][0]!r} is none of a {kind}; correct the heading"
                     )
-            named = {name: (heading.text, heading.unit or "") for name, heading in columns.items()}
             return table_below(grid, at), headings["time"].text, named
     expected = ",".join(("time", *(column for column, *_ in ENVIRONMENT_COLUMNS)))
     raise LaserFormatError(

@@ -59,7 +59,7 @@ def read_ecmc_report(path: Path) -> xr.Dataset:
         if text.startswith("#"):
             name, units = next((name for word, name in _REPORTED.items() if word in text), ""), []
         elif text.startswith("i ") and "tgt_pos" in text and "ref_pos" in text:
-            units = [read_heading(field).unit for field in fields[1:]]
+            units = [unit.name if (unit := read_heading(field).unit) else None for field in fields[1:]]
             found.append((line, text, "UNIT", None, None, units[0] or "none"))
         elif name and units and fields[0].isdecimal():
             if len(fields) != len(units) + 1 or len(set(units)) > 1:

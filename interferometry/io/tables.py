@@ -28,7 +28,7 @@ from interferometry.io.faults import (
 )
 from interferometry.io.spreadsheets import is_workbook, read_sheets
 from thermofuse.resources import vocabulary
-from thermofuse.units import SHARES, find_unit
+from thermofuse.units import SHARE, Unit, find_unit
 
 #: Words of tables: headings, directions, units, months.
 _VOCABULARY = vocabulary("headings")
@@ -172,10 +172,9 @@ def describe_time_zone(path: Path, zones: dict[str, int]) -> str:
 UNIT_WORDS = frozenset(_VOCABULARY["unit_words"])
 _BRACKETS = re.compile(r"\s*[(\[（【{]\s*([^()\[\]（）【】{}]*?)\s*[)\]）】}]\s*")
 _MARK = r"(.*\S)\s*(?:/|,|;|\sin\s|_|\s)\s*"
-_AFTER_MARK = (
-    re.compile(rf"{_MARK}((?:{'|'.join(re.escape(share) for share, _ in SHARES)})\s*\S+)"),
-    re.compile(rf"{_MARK}(\S+)"),
-)
+_AFTER_MARK = (re.compile(rf"{_MARK}({re.sub('[?]P<[a-z]+>', '?:', SHARE.pattern)}\S+)"), re.compile(rf"{_MARK}(\S+)"))
+#: Kinds of units that a test and its conditions have.
+_OF_TESTS = ("length", "angle", "temperature", "pressure")
 #: End of a name that makes a share of the unit behind it, as in "1/8 um".
 _SHARE = re.compile(r"\d[/.,^]-?\d+$")
 #: What may be a unit behind a word: "(tenths)", "in counts", "um/m", "1/8 um".
@@ -186,11 +185,11 @@ _UNKNOWN = re.compile(
 
 @dataclass(frozen=True)
 class Heading:
-    """A heading as it was understood: its role, None where the words are not known, its unit, a key of `UNITS`, or what is none."""
+    """A heading as it was understood: its role, None where the words are not known, its unit, or what is none."""
 
     text: str
     role: str | None
-    unit: str | None
+    unit: Unit | None
     unknown: str = ""
 
 
@@ -215,16 +214,23 @@ def read_heading(text: str) -> Heading:
     return Heading(text, role, unit)
 
 
-def split_unit(text: str) -> tuple[str, str | None]:
+def unit_of_test(text: str) -> Unit | None:
+    """Return the unit of a length, an angle or a condition that a text names; of one letter in any case."""
+    plain = text.strip("[]() ")
+    unit = find_unit(plain) or (find_unit(plain.upper()) if len(plain) == 1 else None)
+    return unit if unit is not None and (unit.kind in _OF_TESTS or unit.name == "%") else None
+
+
+def split_unit(text: str) -> tuple[str, Unit | None]:
     """Split a heading into name and unit."""
     for match in _BRACKETS.finditer(text):
-        if (unit := find_unit(match[1])) is not None:
+        if (unit := unit_of_test(match[1])) is not None:
             return f"{text[: match.start()]} {text[match.end() :]}".strip(), unit
     for pattern in _AFTER_MARK:
         found = pattern.fullmatch(text.strip())
-        if found is not None and (unit := find_unit(found[2])) is not None:
+        if found is not None and (unit := unit_of_test(found[2])) is not None:
             name = re.sub(r"(\s+in|\s*[/,;])$", "", found[1])
-            if _SHARE.search(name) or find_unit(name.split()[-1]) is not None:
+            if _SHARE.search(name) or unit_of_test(name.split()[-1]) is not None:
                 break
             return name, unit
     return text.strip(), None

@@ -44,7 +44,7 @@ def test_numbers_arrive_in_the_canonical_unit(text: str, target: str, value: flo
         (5, 'a length needs its unit in the value; write for example "5 mm"'),
         (True, 'a length needs its unit in the value; write for example "5 mm"'),
         ("five mm", 'this is not a length with a unit; write for example "5 mm"'),
-        ("5 s", '"s" is not a unit of a length; use one of nm, um, mm, cm, m, in, mil'),
+        ("5 s", '"s" is not a unit of a length; use one of nm, um, mm, cm, m, in, mil, uin'),
         ("1e999 mm", 'the number is not finite; write for example "5 mm"'),
     ],
 )

@@ -13,6 +13,7 @@ import xarray as xr
 from interferometry.deviations import DUPLICATE, MISSING, OUT_OF_ORDER, UNREADABLE, sort_readings
 from interferometry.io.faults import LaserFormatError
 from interferometry.io.readings import (
+    NotStated,
     Reading,
     Readings,
     check_and_assemble,
@@ -496,14 +497,18 @@ def test_a_mark_for_no_reading_is_no_value(tmp_path, mark):
 @pytest.mark.parametrize(
     ("header", "line", "message"),
     [
-        ("cycle,direction,position,deviation_um", "{c},{d},{p},{e}", r"'position' has no unit; .*\[mm\]"),
-        ("cycle,direction,position_mm,deviation_degC", "{c},{d},{p},{e}", "position in mm, deviation in degc; give"),
+        (
+            "cycle,direction,position,deviation_um",
+            "{c},{d},{p},{e}",
+            "no heading states the unit of the positions; .* position_unit as one of",
+        ),
+        ("cycle,direction,position_mm,deviation_degC", "{c},{d},{p},{e}", "positions in mm, deviations in degC; give"),
         (f"{HEADER},error_um", f"{LINE},{{e}}", "'deviation_um' and 'error_um' both name the deviation"),
         (HEADER, LINE.replace("2026-03-09T", "3/9/2026 "), "line 2: '3/9/2026 .* the day or the month first"),
         (
             "cycle,position_mm,deviation_um",
             "{c},{p},{e}",
-            "line 1: no column names a direction, and the order of .* 'positive first'",
+            "line 1: no heading or column names the direction .* 'positive first'",
         ),
         ("a,b,c,d", "{c},{d},{p},{e}", "no table of deviations; line 1 is 'a,b,c,d'; expected one reading per line"),
     ],
@@ -607,7 +612,7 @@ def test_a_sheet_for_each_direction_and_positions_that_only_one_of_them_has(tmp_
         read_deviations(tmp_path / "a.xlsx")
 
 
-@pytest.mark.parametrize("unit", ["tenths", "um/m", "1/8 um", "counts", "cm"])
+@pytest.mark.parametrize("unit", ["tenths", "um/m", "1/8 um", "counts"])
 @pytest.mark.parametrize("heading", ["Deviations [{}]", "Deviations in {}", "Unit: {}", "Unit,{}", "Abweichung / {}"])
 def test_a_unit_that_is_none_is_named(tmp_path, unit, heading):
     with pytest.raises(LaserFormatError, match=f"line 1: '{unit}' in .* is no unit of a position or deviation"):
@@ -674,32 +679,48 @@ def test_a_rotary_axis_in_degrees_and_arcseconds(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "taken"),
+    ("text", "lacking"),
     [
-        (f"Target,Run1+,Run1-,Run2+,Run2-\n{DATA}", ["positions: taken as mm", "deviations: taken as um"]),
-        (f"Position,1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", ["positions: taken as mm"]),
-        (f"Target,up 1,down 1,up 2,down 2\n{DATA}", ["positions: taken as mm", "deviations: taken as um"]),
-        (f"Position [mm],1 fwd [um],1 rev [um],2 fwd,2 rev\n{DATA}", []),
-        (f"Angle [deg],1+,1-,2+,2-\n{DATA}", ["deviations: taken as arcsec"]),
+        (f"Target,Run1+,Run1-,Run2+,Run2-\n{DATA}", ("position_unit", "deviation_unit")),
+        (f"Position,1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", ("position_unit",)),
+        (f"Target [mm],up 1,down 1,up 2,down 2\n{DATA}", ("deviation_unit",)),
+        (f"Target [mm],1,2,3,4\n{DATA}", ("deviation_unit", "directions")),
+        (f"Position [mm],1 fwd [um],1 rev [um],2 fwd,2 rev\n{DATA}", ()),
     ],
 )
-def test_units_that_no_heading_states_are_taken_and_noted_where_the_values_allow_them(tmp_path, text, taken):
-    semicolons = text.replace(",", ";").replace(".", ",")
-    for one in (text, semicolons):
-        test = read_wide(tmp_path, one, rotary=True)
-        assert test["deviation"].values == pytest.approx(WIDE_EXPECTED, abs=1e-6)
-        told = [note.rpartition("of the ")[2] for note in json.loads(test.attrs["notes"]) if "unit" in note]
-        assert told == taken
-    if "deviations: taken as um" in taken:
-        for factor in ("e-2", "e+3"):
-            beyond = "\n".join(
-                ",".join([row[0], *(f"{one}{factor}" for one in row[1:])])
-                for row in (line.split(",") for line in DATA.split("\n"))
-            )
-            with pytest.raises(
-                LaserFormatError, match="no heading states the unit of the deviations, whose largest is"
-            ):
-                read_wide(tmp_path, text.replace(DATA, beyond))
+def test_what_no_heading_states_is_asked_and_taken_as_it_is_stated(tmp_path, text, lacking):
+    choices = {"position_unit": "mm", "deviation_unit": "um", "directions": "positive first"}
+    stated = {key: choices[key] for key in lacking}
+    if lacking:
+        with pytest.raises(NotStated) as refused:
+            read_wide(tmp_path, text)
+        assert refused.value.keys == lacking
+    test = read_wide(tmp_path, text, **stated)
+    assert test["deviation"].values == pytest.approx(WIDE_EXPECTED, abs=1e-6)
+    if "deviation_unit" in stated:
+        in_mm = read_wide(tmp_path, text, **(stated | {"deviation_unit": "mm"}))
+        assert in_mm["deviation"].values == pytest.approx(1e3 * WIDE_EXPECTED, abs=1e-6)
+    for contrary in ({"position_unit": "in"}, {"deviation_unit": "nm"}):
+        if not contrary.keys() & stated:
+            with pytest.raises(LaserFormatError, match=r"the table states the unit .* remove"):
+                read_wide(tmp_path, text, **stated, **contrary)
+
+
+def test_a_direction_that_the_order_of_the_positions_contradicts_is_asked(tmp_path):
+    """Runs named "-" towards larger positions: another sign of the travel; sorted lines of both directions contradict nothing."""
+    head = "run,direction,position_mm,deviation_um\n"
+    lines = {"+": [f"{{}},{{}},{p},{p / 10}" for p in (0, 20, 40)]}
+    lines["-"] = lines["+"][::-1]
+
+    def written(*runs):
+        return head + "\n".join(line.format(n, sign) for n, sign, order in runs for line in lines[order])
+
+    with pytest.raises(NotStated, match="against the sign of the travel") as refused:
+        read_wide(tmp_path, written((1, "-", "+"), (1, "+", "-")))
+    assert refused.value.keys == ("directions",)
+    turned = read_wide(tmp_path, written((1, "-", "+"), (1, "+", "-")), directions="positive first")
+    assert turned.sizes["cycle"] == 1
+    assert read_wide(tmp_path, written((1, "+", "+"), (1, "-", "+"))).attrs["missing"] == 0
 
 
 def test_numbers_of_targets_are_no_positions(tmp_path):
@@ -714,7 +735,7 @@ def test_numbers_of_targets_are_no_positions(tmp_path):
         (f"Position [mm],1+ [um],1- [um],2+ [um],- [um]\n{DATA}", "'- .um.' has no number, but other runs have"),
         (
             f"Position [mm],1 [um],2 [um],3 [um],4 [um]\n{DATA}",
-            "line 1: the runs '1 .um.' to '4 .um.' name no direction; .* state directions",
+            "line 1: no heading or column names the direction of the runs.* state directions",
         ),
     ],
 )
