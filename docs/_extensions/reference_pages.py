@@ -110,7 +110,7 @@ def type_of(schema: Mapping[str, Any]) -> str:
         return f"`{schema['const']}`"
     kind = schema.get("type", "any value")
     if schema.get("format") == "quantity":
-        return "number with unit"
+        return f"number with unit, as `{schema['examples'][0]}`"
     if kind == "array" and "prefixItems" in schema:
         return f"list of {len(schema['prefixItems'])}: {type_of(schema['prefixItems'][0])}"
     if kind == "array":
@@ -130,22 +130,21 @@ def cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|").replace("*", "\\*").replace("[[", "&#91;[").replace("<", "&lt;")
 
 
-def model_section(name: str, schema: Mapping[str, Any]) -> str:
+def model_section(name: str, schema: Mapping[str, Any], models: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the section of one model: its description and a row for each key."""
-    rows = kinds_table(schema["oneOf"]) if "oneOf" in schema else keys_table(schema)
+    rows = kinds_table(schema["oneOf"]) if "oneOf" in schema else keys_table(schema, models)
     about = first_sentence(schema.get("description")).replace("``", "`")
     return f"({anchor(name)})=\n## {schema.get('heading', name)}\n\n{about}\n\n" + "\n".join(rows) + "\n\n"
 
 
-def keys_table(schema: Mapping[str, Any]) -> list[str]:
-    """Return a row for each key of a model."""
-    properties = schema.get("properties", {})
-    described = any(value.get("description") for value in properties.values())
-    heads = ["key", "value", "left out", *(["meaning"] if described else [])]
-    rows = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    for key, value in properties.items():
-        meaning = [cell(value.get("description", ""))] if described else []
-        rows.append(f"| {' | '.join([f'`{key}`', type_of(value), left_out(key, schema), *meaning])} |")
+def keys_table(schema: Mapping[str, Any], models: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a row for each key of a model; a table within it means what its own model says."""
+    rows = ["| key | value | left out | meaning |", "|---|---|---|---|"]
+    for key, value in schema.get("properties", {}).items():
+        named = re.search(r"#/\$defs/(\w+)", str(value))
+        model = models.get(named[1], {}) if named else {}
+        means = cell(value.get("description") or first_sentence(model.get("description")).replace("``", "`"))
+        rows.append(f"| `{key}` | {type_of(value)} | {left_out(key, schema)} | {means} |")
     return rows
 
 
@@ -154,22 +153,29 @@ def left_out(key: str, schema: Mapping[str, Any]) -> str:
     if key in schema.get("required", []):
         return "must be given"
     value = schema["properties"][key]
-    return value.get("absent") or ("" if value.get("default") in (None, "") else f"`{value['default']}`")
+    default, written = value.get("default"), value.get("examples", [""])[0]
+    unit = f" {written.rpartition(' ')[2]}" if value.get("format") == "quantity" else ""
+    none = default in (None, "", []) or isinstance(default, dict)
+    return value.get("absent") or ("" if none else f"`{default}{unit}`")
 
 
 def kinds_table(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a row for each kind of a model whose keys hang on its name."""
-    rows = ["| name | further keys |", "|---|---|"]
+    """Return a row for each kind of a model whose keys hang on its name, and a row for each of these keys."""
+    rows = ["| name | further keys, with the values that hold where they are left out |", "|---|---|"]
+    known: dict[str, Mapping[str, Any]] = {}
     for kind in kinds:
-        keys = [f"`{key}`" for key in kind["properties"] if key != "name"]
-        rows.append(f"| `{kind['title']}` | {', '.join(keys)} |")
-    return rows
+        keys = {key: value for key, value in kind["properties"].items() if key != "name"}
+        said = [f"`{key} = {value['default']}`" for key, value in keys.items() if value.get("default") is not None]
+        rows.append(f"| `{kind['title']}` | {', '.join(said)} |")
+        known |= keys
+    meanings = [f"| `{key}` | {cell(value['description'])} |" for key, value in known.items()]
+    return [*rows, "", "| key | meaning |", "|---|---|", *meanings]
 
 
 def schema_page(schema: Mapping[str, Any]) -> str:
     """Return the models of a JSON Schema, the outermost first."""
     models = {schema.get("title", "file"): schema, **schema.get("$defs", {})}
-    return "".join(model_section(name, model) for name, model in models.items())
+    return "".join(model_section(name, model, models) for name, model in models.items())
 
 
 def campaign_page(schema: Mapping[str, Any]) -> str:
@@ -178,9 +184,7 @@ def campaign_page(schema: Mapping[str, Any]) -> str:
     for name, model in schema["$defs"].items():
         heading, _, about = first_sentence(model.get("description")).replace("`", "").partition(": ")
         table = re.fullmatch(r"\[+([\w.]+)\]+", heading)
-        properties = {
-            key: written(value) | {"description": meaning(value)} for key, value in model.get("properties", {}).items()
-        }
+        properties = {key: written(value) for key, value in model.get("properties", {}).items()}
         described = {"heading": heading, "description": f"{about[:1].upper()}{about[1:]}"} if table else {}
         models[name] = model | {"properties": properties} | described
     tables = {key: written(value) for key, value in schema["properties"].items()}
@@ -190,17 +194,17 @@ def campaign_page(schema: Mapping[str, Any]) -> str:
 
 
 def meaning(value: Mapping[str, Any]) -> str:
-    """Return what a key is called, what else is said of it, and what its values mean."""
+    """Return what a key is called, what else is said of it, and what its values mean; nothing of a table, which says it itself."""
+    if "/$defs/" in str(value) and not value.get("description"):
+        return ""
     told = [*value.get("labels", [value["title"]]), value.get("description", "")]
     return "; ".join(filter(None, [*told, *(f"`{one}`: {text}" for one, text in (value.get("choices") or {}).items())]))
 
 
 def written(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a property without what TOML has no word for: null, and tables that stand for themselves where they are left out."""
+    """Return a property with its meaning, without what TOML has no word for: null, and tables as they are where they are left out."""
     kept = [choice for choice in value.get("anyOf", []) if choice.get("type") != "null"]
-    rest = {key: part for key, part in value.items() if key != "anyOf"}
-    if isinstance(rest.get("default"), dict):
-        del rest["default"]
+    rest = {key: part for key, part in value.items() if key != "anyOf"} | {"description": meaning(value)}
     return rest | ({"anyOf": kept} if kept else {})
 
 

@@ -216,31 +216,41 @@ class InstrumentTable(Table, title="Instruments"):
 class ReportTable(Table, title="Machine, people and conditions, as the sheet to sign names them"):
     """``[report]``: conditions of the test as ISO 230-2 asks for them, as the sheet names and orders them, "not stated" where left out."""
 
-    report_number: str = key("", ask=True)
-    customer: str = key("", ask=True)
-    machine: str = key("", example="name of the machine", ask=True)
+    report_number: str = key("", about="that the sheet bears", ask=True)
+    customer: str = key("", about="for whom the test was made", ask=True)
+    machine: str = key("", example="name of the machine", about="by which tests are put together", ask=True)
     machine_serial_number: str = key("", "Serial number of the machine", ask=True)
-    control: str = key("", ask=True)
-    location: str = key("", ask=True)
-    operator: str = key("", ask=True)
-    approved_by: str = key("", ask=True)
-    sign_convention: str = key("", example="actual minus target position", ask=True, of=_TEST)
+    control: str = key("", about="make and version of the machine's control", ask=True)
+    location: str = key("", about="where the machine stands", ask=True)
+    operator: str = key("", about="who made the test", ask=True)
+    approved_by: str = key("", about="who signs", ask=True)
+    sign_convention: str = key(
+        "", example="actual minus target position", about="what a positive deviation means", ask=True, of=_TEST
+    )
     axis_travel_mm: PositiveMillimetres | None = key(None, "Travel of the axis", example="900 mm", ask=True, of=_AXIS)
     screw_lead_mm: PositiveMillimetres | None = key(
         None, "Lead of the screw", example="10 mm", about="targets at whole leads are named", ask=True, of=_AXIS
     )
-    feed_mm_per_min: Feed | None = key(None, example="5000 mm/min", ask=True, of=_AXIS)
+    feed_mm_per_min: Feed | None = key(None, "Feed between the targets", example="5000 mm/min", ask=True, of=_AXIS)
     dwell_s: PositiveSeconds | None = key(None, "Dwell at a target", example="3 s", ask=True, of=_AXIS)
-    warm_up: str = key("", "Warm-up", ask=True, of=_TEST)
+    warm_up: str = key("", "Warm-up", about="what the machine did before the test", ask=True, of=_TEST)
     machine_compensation: str = key(
         "", "Compensation of the machine", about='"none", or the file of the table that was active', ask=True, of=_TEST
     )
-    air_temperature_before_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
-    air_temperature_after_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
-    material_temperature_before_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
-    material_temperature_after_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
+    air_temperature_before_degC: Celsius | None = key(
+        None, "Air temperature before the test", absent="as logged", show=True, of=_AXIS
+    )
+    air_temperature_after_degC: Celsius | None = key(
+        None, "Air temperature after the test", absent="as logged", show=True, of=_AXIS
+    )
+    material_temperature_before_degC: Celsius | None = key(
+        None, "Material temperature before the test", absent="as logged", show=True, of=_AXIS
+    )
+    material_temperature_after_degC: Celsius | None = key(
+        None, "Material temperature after the test", absent="as logged", show=True, of=_AXIS
+    )
     sensor_places: str = key("", "Places of the sensors", ask=True, of=_TEST)
-    remarks: str = key("", show=True)
+    remarks: str = key("", about="whatever else the sheet has to say", show=True)
     instrument: tuple[InstrumentTable, ...] = key((), "Instrument", rows=1)
 
 
@@ -386,8 +396,8 @@ class _Measured(Table):
 class StateTable(_Measured):
     """One of ``states`` of a region: a cycle in which a contact sensor measured the region's temperature."""
 
-    cycle: int = Field(ge=1)
-    temperature_degC: Celsius
+    cycle: int = key(..., "Number of the cycle", ge=1)
+    temperature_degC: Celsius = key(..., "Temperature that the contact sensor measured in it")
     temperature_u_K: KelvinU = 0.1
 
 
@@ -401,15 +411,17 @@ class RegionTable(_Measured):
     The emissivity is given or comes from two states.
     """
 
-    name: str = Field(min_length=1)
-    spot: Point | None = None
-    line: tuple[Point, Point] | None = None
-    rectangle: tuple[Point, Point] | None = None
-    ellipse: tuple[Point, Point] | None = None
-    polygon: tuple[Point, ...] | None = None
-    emissivity: Fraction | None = None
+    name: str = key(..., "Name of the region", min_length=1)
+    spot: Point | None = key(None, about="a point: column and row in px, or x and y in mm, as of every shape")
+    line: tuple[Point, Point] | None = key(None, about="its two ends")
+    rectangle: tuple[Point, Point] | None = key(None, about="two opposite corners")
+    ellipse: tuple[Point, Point] | None = key(None, about="two opposite corners of the rectangle around it")
+    polygon: tuple[Point, ...] | None = key(None, about="its corners in order")
+    emissivity: Fraction | None = key(None, "Emissivity of the region, 0 to 1", absent="that of the frames")
     emissivity_u: FractionU | None = None
-    states: tuple[StateTable, StateTable] | None = None
+    states: tuple[StateTable, StateTable] | None = key(
+        None, about="two cycles in which a contact sensor measured the region, from which its emissivity follows"
+    )
 
     @model_validator(mode="after")
     def _is_whole(self) -> RegionTable:
@@ -518,9 +530,13 @@ class ThermographyTable(_Measured, title="Camera"):
         None, "Emissivity of the surface, 0 to 1", example="0.95 +- 0.02", absent=_STORED, ask=True
     )
     emissivity_u: FractionU | None = key(None, absent="assumed, and named so")
-    reflected_temperature_degC: Celsius | None = key(None, absent=_STORED, show=True)
+    reflected_temperature_degC: Celsius | None = key(
+        None, about="apparent temperature of what the surface reflects", absent=_STORED, show=True
+    )
     reflected_temperature_u_K: KelvinU | None = None
-    atmospheric_temperature_degC: Celsius | None = key(None, absent=_STORED, show=True)
+    atmospheric_temperature_degC: Celsius | None = key(
+        None, "Temperature of the air before the camera", absent=_STORED, show=True
+    )
     atmospheric_temperature_u_K: KelvinU | None = None
     relative_humidity: Fraction | None = key(
         None, "Relative humidity, 0 to 1", example="0.45", absent=_STORED, show=True
@@ -766,9 +782,13 @@ class ColumnTable(Table):
     ``range`` is what its sensor can read, as ``["-20 degC", "300 degC"]``; numbers outside are no readings.
     """
 
-    role: Literal["temperature", "displacement", "driver"] | None = None
-    unit: str = ""
-    range: tuple[Celsius, Celsius] | None = None
+    role: Literal["temperature", "displacement", "driver"] | None = key(
+        None, "What the column holds", absent="as its unit says"
+    )
+    unit: str = key("", "Unit of the column, or of one count")
+    range: tuple[Celsius, Celsius] | None = key(
+        None, "What its sensor can read", about="numbers outside are no readings"
+    )
 
 
 #: A unit alone, or a table with role and unit.
@@ -836,7 +856,7 @@ class LoggedTable(Table):
     time_zone: TimeZone | None = key(None, _ZONE)
     header_rows: HeaderRows | None = None
     missing: tuple[float | str, ...] = key((), "Marks for no reading")
-    columns: dict[str, StatedColumn] = {}
+    columns: dict[str, StatedColumn] = key({}, about="role and unit of every column, by its heading")
 
 
 class DriversTable(LoggedTable, title="Logged quantities"):

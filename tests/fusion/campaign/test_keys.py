@@ -12,7 +12,7 @@ import pytest
 
 from fusion.app.setup.campaign import CampaignText
 from fusion.app.setup.form import form_fields, read_fields, write_fields
-from fusion.campaign.config import ReportTable, campaign_schema
+from fusion.campaign.config import ReportTable, Table, campaign_schema
 from fusion.campaign.draft import Asker, write_campaign
 from fusion.campaign.schema import Key, keys_of, known_keys
 from fusion.campaign.values import QuantityError, split_uncertainty
@@ -20,6 +20,7 @@ from fusion.pipeline.iso230 import state_conditions
 from fusion.report.sheet import Stated
 from fusion.results.numbers import print_unit
 from fusion.results.results import in_this_schema
+from fusion.twin.recipe_file import recipe_schema
 from tests.fusion.campaign_parts import write_laser
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -93,6 +94,20 @@ def pages() -> ModuleType:
 @pytest.fixture(scope="module")
 def reference(pages: ModuleType) -> str:
     return str(pages.campaign_page(campaign_schema()))
+
+
+def test_every_key_of_campaign_file_and_recipe_has_a_meaning_and_its_unit(pages: ModuleType, reference: str) -> None:
+    recipe = str(pages.schema_page(recipe_schema()))
+    rows = re.findall(r"^\| `(\w+)` \|(?: (.*) \| (.*) \|)? (.*) \|$", reference + recipe, re.MULTILINE)
+    assert len(rows) > 300
+    assert [key for key, *_, said in rows if said.lower().replace(" ", "_") in ("", key)] == []
+    for model in Table.__subclasses__():
+        for name, field in model.model_fields.items():
+            if field.alias != name and (unit := name.removeprefix(f"{field.alias}_")) != "px":
+                assert (
+                    f"| `{field.alias}` | {'list of 2: ' * ('tuple' in str(field.annotation))}number with unit, as `"
+                    in reference
+                ), unit
 
 
 @each_key
