@@ -21,8 +21,8 @@ from fusion.pipeline.run import run_campaign
 
 #: A README loads its pictures for every reader.
 _MOST_BYTES = 150_000
-#: Name of the picture -> what of the report is brought to the top of the window, and the window's height in px.
-_PARTS = {"report": ("body", 735), "thermal-map": ("#fields", 705)}
+#: Name of the picture -> what of the report it shows, and the height of the window in px, in which a page is cut off.
+_PARTS = {"report": ("body", 735), "thermal-map": ("#figure-contact_sheet", 705)}
 _WIDTH = 1200
 _LOADING_MS = 120_000
 
@@ -64,9 +64,9 @@ def take_report(browser: Browser, report: Path, folder: Path, parts: Mapping[str
     for name, (place, height) in parts.items():
         with open_page(browser, report.resolve().as_uri(), height) as page:
             page.wait_for_load_state("networkidle")
-            page.locator(place).first.evaluate("element => element.scrollIntoView({block: 'start'})")
             page.wait_for_timeout(2000)
-            (folder / f"{name}.png").write_bytes(compact(page.screenshot()))
+            shown = page if place == "body" else page.locator(place).first
+            (folder / f"{name}.png").write_bytes(compact(shown.screenshot()))
 
 
 def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> None:
@@ -79,8 +79,12 @@ def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> N
             page.set_default_timeout(_LOADING_MS)
             page.get_by_text("Results", exact=True).first.click()
             page.get_by_text("Open", exact=True).first.click()
-            page.locator("canvas").first.wait_for()
+            page.locator("canvas:visible").first.wait_for()
             page.wait_for_timeout(8000)
+            page.get_by_text("Position shown everywhere").evaluate(
+                "element => element.scrollIntoView({block: 'start'})"
+            )
+            page.wait_for_timeout(1000)
             (folder / "app.png").write_bytes(compact(page.screenshot()))
     finally:
         shutil.rmtree(copy.parent)
@@ -97,7 +101,7 @@ def take_thermograms(browser: Browser, folder: Path) -> None:
         take_report(browser, test / "results" / "report.html", folder, {"only-flir-files": ("body", 800)})
 
 
-#: Picture of the gallery -> the public files that it is made of, and what of their report is brought to the top of the window.
+#: Picture of the gallery -> the public files that it is made of, and what it shows of their report.
 _GALLERY = {
     "spindle": ("CAIVIAC__FL_THERMAL", ("body", 800)),
     "thermogram": ("FLIR_E40.jpg", ("body", 720)),
@@ -124,11 +128,11 @@ def take_gallery(browser: Browser, folder: Path) -> None:
 def take_table(browser: Browser, folder: Path) -> None:
     """Write a picture of the application that asks for the columns of a table."""
     with tempfile.TemporaryDirectory() as name:
-        minutes = np.arange(0, 360, 0.5)
+        minutes = np.arange(2160) / 6
         warm = 1 - np.exp(-minutes / 60)
         columns = {
-            "Time": minutes, "TT_100": 21 + 9 * warm, "TT_101": 21 + 4 * warm**2, "speed": np.where(minutes < 240, 3000, 0),
-            "Z": 0.016 * warm, "sample": np.arange(minutes.size),
+            "Time": minutes, "TT_100": 21 + 9.6 * warm, "TT_101": 21 + 0.9 * warm**2, "speed": np.where(minutes < 240, 3000, 0),
+            "X": 0.0134 * warm, "Z": 0.016 * warm,
         }  # fmt: skip
         test = Path(name) / "Lathe 3"
         test.mkdir()

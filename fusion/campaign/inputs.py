@@ -629,7 +629,7 @@ def _checksum_notices(frames: Sequence[FrameReference]) -> Iterator[Notice]:
             "frames_checksum",
             f"The headers of {counted(len(named), 'frame')} differ from their checksums: {listed(named)}. The files were changed after the "
             "camera wrote them.",
-            "Compare these files with the originals, or leave them out: their parameters, and temperatures, may be wrong.",
+            "Compare these files with the originals, or leave them out (parameters and temperatures may be wrong).",
         )
 
 

@@ -822,7 +822,7 @@ def pixel_notices(flags: np.ndarray, treatment: str) -> Iterator[Notice]:
         yield Notice(
             "bad_pixels",
             f"Pixels that do not follow their neighbours: {np.count_nonzero(flags)} ({named}); they {treatment}.",
-            "Have the camera replace them (a one-point correction, or its maker's service).",
+            "Have the camera replace its bad pixels (a one-point correction, or its maker's service).",
         )
 
 
