@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import panel as pn
-from bokeh.models import LinearColorMapper
 
 from fusion.app import parts as ui
-from fusion.app.results.charts import draw_cells, shown_if
+from fusion.app.results.charts import shown_if, to_scale
 from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
 from fusion.messages import reported
 from fusion.pipeline.watch import Enough, FinishedCycle, LiveState, follow
-from fusion.report.charts.style import CATEGORIES, Chart, Courses, new_figure, palette, span_words
+from fusion.report.charts.plan import LAYERS, draw_map, extent_of
+from fusion.report.charts.style import CATEGORIES, Chart, Courses, new_figure, span_words
 from fusion.results.numbers import number
 from fusion.results.progress import counted
 from interferometry.plots import ACCENT, INK, MUTED
@@ -103,8 +103,9 @@ def plot_field(course: Course) -> Chart | None:
         return None
     number, shown = course.with_field.number, course.with_field.field
     low, high = course.field_range_degC
-    mapper = LinearColorMapper(palette(), low=low, high=max(high, low + 0.1), nan_color="#e1e5e7")
-    drawn, _ = draw_cells(shown, mapper, "temperature", "°C", height=320)
+    extent = extent_of(shown.to_dataset(name="temperature"))
+    drawn = draw_map(shown.values, extent, LAYERS[1], {"low": low, "high": max(high, low + 0.1)})
+    to_scale(drawn, extent)
     seen = f"Temperature of the table in cycle {number}: {span_words(shown, '°C')}."
     return Chart(drawn, seen, {})
 

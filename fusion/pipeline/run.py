@@ -521,4 +521,4 @@ def _finish(run: Run, made: Mapping[str, Any]) -> Results:
     write_text(run.folder / "report.html", page)
     stamp_run(run.stamps, run.campaign, run.inputs, [*run.products, *(run.folder / name for name in PAGES)])
     run.report("report", 1, 1)
-    return results
+    return results.of_folder(run.folder)

@@ -7,11 +7,12 @@ determine it.
 from __future__ import annotations
 
 import json
+import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Literal
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError
 
@@ -203,10 +204,26 @@ class Parts(ResultPart):
                 setattr(self, name, part)
 
 
+@dataclass(frozen=True)
+class Report:
+    """The report of a run, one file; a notebook shows it in a frame."""
+
+    path: Path
+
+    def _repr_html_(self) -> str:
+        page = escape(self.path.read_text(encoding="utf-8"), quote=True)
+        return f'<iframe srcdoc="{page}" title="report" style="width: 100%; height: 45rem"></iframe>'
+
+    def open_in_browser(self) -> None:
+        """Open the report in the browser of the system."""
+        webbrowser.open(self.path.resolve().as_uri())
+
+
 class Results(Parts, _Heading):
     """results.json of a run; a part that a campaign does not have is absent."""
 
     model_config = ConfigDict(title="thermofuse results", frozen=True)
+    _folder: ClassVar[Path | None] = None
 
     def __str__(self) -> str:
         return "\n".join(f"{name}: {text}" for name, text in self._summary())
@@ -216,6 +233,19 @@ class Results(Parts, _Heading):
     def _repr_html_(self) -> str:
         rows = (f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in self._summary())
         return f"<table>{''.join(rows)}</table>"
+
+    def of_folder(self, folder: Path) -> Results:
+        """Return itself as the results of a folder."""
+        object.__setattr__(
+            self, "_folder", folder.resolve()
+        )  # no part of the content: equal results are equal in any folder
+        return self
+
+    def report(self) -> Report:
+        """Return report.html of the run: shown in a notebook, and opened by its `open_in_browser`."""
+        if self._folder is None or not (self._folder / "report.html").is_file():
+            raise ResultsError(f"{self.campaign}: there is no report.html; read the results of a run by read_results")
+        return Report(self._folder / "report.html")
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the errors of the closed loop on the hold-out set; see `fusion.results.plots.plot_loop`."""
@@ -287,7 +317,8 @@ def read_results(folder: str | Path) -> Results:
 
     Notes
     -----
-    The products beside them are NetCDF: ``xarray.open_dataset("results/deviations.nc")``.
+    The products beside them are NetCDF: ``xarray.open_dataset("results/deviations.nc")``. There, ``drift_profile`` is ``profile`` of
+    `estimate_drift`, and so on with every part of that file.
 
     Examples
     --------
@@ -309,7 +340,7 @@ def read_results(folder: str | Path) -> Results:
     except (ValueError, RecursionError) as error:
         raise _foreign(path, f"not JSON: {error}") from None
     require_own(folder, [path.name])
-    return results
+    return results.of_folder(folder)
 
 
 def in_this_schema(content: Any) -> Any:

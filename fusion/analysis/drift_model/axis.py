@@ -101,6 +101,7 @@ from fusion.analysis.effects.library import library
 from fusion.analysis.levels import SEARCH_LEVEL, SECOND_LEVEL
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
+from fusion.results.numbers import measured, print_unit
 from interferometry.common import one_thread
 from interferometry.drift.kalman import DriftModelError
 from thermography.large_arrays import empty_array, fill_array, in_pieces
@@ -846,6 +847,13 @@ class AxisResult(LoopResult):
     declared_coefficients: list[schema.DeclaredCoefficient]
     before: ModelFit
     after: ModelFit
+
+    def _summary(self) -> list[tuple[str, str]]:
+        """What `LoopResult` tells, led by the coefficients with U (k = 2), which holds what one target or part of the test moves."""
+        found = [(one.effect, one, one.jackknife_u) for one in self.declared_coefficients]
+        found += [(step.effect, one, None) for step in self.steps for one in step.coefficients]
+        told = [(name, measured(c.value, np.fmax(c.u, moved or 0.0), print_unit(c.unit))) for name, c, moved in found]
+        return [*told, *super()._summary()]
 
     def described(
         self,

@@ -10,7 +10,7 @@ import numpy as np
 import panel as pn
 import xarray as xr
 from bokeh.events import Tap
-from bokeh.models import ColorBar, ColumnDataSource, GlyphRenderer, HoverTool, LinearColorMapper
+from bokeh.models import ColorBar, ColumnDataSource, HoverTool, LinearColorMapper
 from bokeh.plotting import figure
 
 from fusion.app import parts as ui
@@ -27,19 +27,10 @@ from fusion.report.campaign import (
     steps_table,
 )
 from fusion.report.charts import readings
-from fusion.report.charts.plan import (
-    Extent,
-    Layer,
-    add_cells,
-    draw_followed,
-    draw_map,
-    draw_places,
-    extent_of,
-    new_plan,
-)
+from fusion.report.charts.plan import Extent, Layer, draw_followed, draw_map, draw_places, extent_of
 from fusion.report.charts.readings import cycle_map
 from fusion.report.charts.record import draw_record
-from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
+from fusion.report.charts.style import CATEGORIES, Chart, add_series, new_figure, of_rank, palette
 from fusion.report.findings import action, next_steps, step_phrase
 from fusion.report.wording import (
     Table,
@@ -449,18 +440,6 @@ def to_scale(drawn: figure, extent: Extent) -> None:
     keep_scale(drawn, (left - margin, right + margin), (top + margin, bottom - margin))
 
 
-def draw_cells(
-    field: xr.DataArray, mapper: LinearColorMapper, name: str, unit: str, *, height: int
-) -> tuple[figure, GlyphRenderer]:
-    """Draw a field (y, x) on the plan with its colour bar."""
-    extent = extent_of(field.to_dataset(name=name))
-    drawn = new_plan(extent, height=height)
-    cells = add_cells(drawn, field.values, extent, mapper, [(name, f"@image{{0.00}} {unit}")])
-    to_scale(drawn, extent)
-    add_colour_bar(drawn, mapper, f"{name} / {unit}")
-    return drawn, cells
-
-
 def draw_ring(drawn: figure, source: ColumnDataSource) -> None:
     """Ring a position, to be seen on any colour."""
     for colour, width in ((INK, 5), ("#ffffff", 2.5)):
@@ -475,22 +454,24 @@ def target_place(fields: xr.Dataset | None, target: int | None) -> tuple[float, 
     return float(here["target_x"]), float(here["target_y"])
 
 
-# Positions that stand out, as cards with the field of the camera around each.
-
-#: Half the side of the part of the field that a card shows, mm.
-_AROUND_MM = 60.0
+# Positions that stand out, as cards below the scatter of every position.
 
 
 def anomaly_cards(products: Products, selection: Selection) -> ui.Parts:
-    """Return one card for each position that stands out of those that were examined, or say that there is none."""
+    """Return the scatter of every position and a card for each that stands out, or say that there is none."""
     anomalies = products.results.anomalies or ()
     if not anomalies:
         return [ui.paragraph("No position stands out from the others, at a family-wise error of 5 %.")]
-    return [_card(products, selection, anomaly) for anomaly in anomalies]
+    cards: ui.Parts = [_card(products, selection, anomaly) for anomaly in anomalies]
+    if products.deviations is None or products.drift is None:
+        return cards
+    flagged = {anomaly.target for anomaly in anomalies}
+    scatter = readings.plot_position_scatter(products.drift, products.deviations["position"], flagged)
+    return [shown(scatter, caption("anomalies")), *cards]
 
 
 def _card(products: Products, selection: Selection, anomaly: AnomalyPart) -> pn.viewable.Viewable:
-    """Return what stands out, what it rests on, what to inspect, and the field around it."""
+    """Return what stands out, what it rests on, and what to inspect."""
     told = describe_anomaly(anomaly)
     sentence = conditional(told["sentence"], products.results.inputs, *anomaly_figures(anomaly))
     show = pn.widgets.Button(label=f"Show position {anomaly.target} everywhere")
@@ -503,35 +484,4 @@ def _card(products: Products, selection: Selection, anomaly: AnomalyPart) -> pn.
         ui.paragraph(f"What to inspect: {told['check']}"),
         show,
     ]
-    return ui.column(*parts, *_field_around(products, selection, anomaly.target))
-
-
-def _field_around(products: Products, selection: Selection, target: int) -> ui.Parts:
-    """Return the rise about a position in the chosen cycle, on one scale for all cycles."""
-    unseen = [ui.note("The camera did not see this position.")]
-    at = target_place(products.fields, target)
-    if at is None:
-        return unseen
-    around = {axis: slice(middle - _AROUND_MM, middle + _AROUND_MM) for axis, middle in zip("xy", at, strict=True)}
-    about = products.camera["temperature_rise"].sel(around)
-    if min(about.sizes["x"], about.sizes["y"]) < 2:
-        return unseen
-    layer = next(layer for layer in products.layers if layer.variable == "temperature_rise")
-    scale, _ = products.scale(layer)
-    mapper = LinearColorMapper(palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7")
-    drawn, cells = draw_cells(about.sel(cycle=selection.cycle), mapper, "rise", "K", height=300)
-    drawn.max_width = 420
-    draw_ring(drawn, ColumnDataSource({"x": at[:1], "y": at[1:]}))
-    told = ui.markup("")
-
-    def show() -> None:
-        values = about.sel(cycle=selection.cycle).values
-        cells.data_source.data = {"image": [values.astype(np.float32)]}
-        seen = values[np.isfinite(values)]
-        span = f"{number(float(seen.min()))} to {number(float(seen.max()))} K" if seen.size else "not seen"
-        text = f"Rise within {_AROUND_MM:.0f} mm of the position in cycle {selection.cycle}: {span}."
-        told.object = ui.paragraph_markup(text, kind="note")
-
-    selection.watch(show, "cycle")
-    show()
-    return [shown_drawing(drawn), told]
+    return ui.column(*parts)

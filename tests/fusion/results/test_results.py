@@ -202,3 +202,13 @@ def test_a_schema_of_the_future_is_refused(tmp_path: Path) -> None:
     (tmp_path / "results.json").write_text(json.dumps({"schema": 5, "campaign": "A", "warnings": []}))
     with pytest.raises(ResultsError, match="schema: Input should be 4"):
         read_results(tmp_path)
+
+
+def test_results_of_a_folder_show_their_report(tmp_path):
+    results = assemble("A", PARTS, [])
+    with pytest.raises(ResultsError, match=r"no report\.html"):
+        results.report()
+    (tmp_path / "report.html").write_text('<p class="a">R & D</p>', encoding="utf-8")
+    report = results.of_folder(tmp_path).report()
+    assert report.path == tmp_path / "report.html" and results == assemble("A", PARTS, [])
+    assert 'srcdoc="&lt;p class=&quot;a&quot;&gt;R &amp; D&lt;/p&gt;"' in report._repr_html_()
