@@ -177,28 +177,15 @@ def lay_grid(seconds: Array, temperature: Array, drivers: Array | None) -> list[
 def _grid(seconds: Array, temperature: Array, loads: Array, length: float, *, is_fine: bool) -> Grid:
     """Medians of the samples of each step; steps in a pause are left out, as in a record."""
     number = np.floor((seconds - seconds[0]) / length + 1e-6).astype(int)
-    numbers, first, count = np.unique(number, return_index=True, return_counts=True)
-    values = np.full((numbers.size, temperature.shape[1]), np.nan)
-    mean = np.zeros((numbers.size, loads.shape[1]))
-    for place, (start, many) in enumerate(zip(first, count, strict=True)):
-        part = temperature[start : start + many]
-        values[place] = part[0] if many == 1 else _column_medians(part)
-        mean[place] = loads[start : start + many].mean(axis=0)
+    medians = pd.DataFrame(temperature).groupby(number).median()
+    mean = pd.DataFrame(loads).groupby(number).mean().reindex(medians.index)
+    numbers, values = medians.index.to_numpy(), np.array(medians, order="C")
     known = np.isfinite(values)
     middle = (numbers + 0.5) * length + seconds[0] - 0.5 * float(np.median(np.diff(seconds)))
     for k in range(values.shape[1]):
         here = known[:, k]
         values[:, k] = np.interp(middle, middle[here], values[here, k]) if here.any() else 0.0
-    return Grid(middle, length, values, known, mean, is_fine)
-
-
-def _column_medians(part: Array) -> Array:
-    missing = np.isnan(part)
-    if not missing.any():
-        return np.asarray(np.median(part, axis=0))
-    return np.array(
-        [np.median(column[np.isfinite(column)]) if np.isfinite(column).any() else np.nan for column in part.T]
-    )
+    return Grid(middle, length, values, known, np.array(mean, order="C"), is_fine)
 
 
 def _differences(values: Array, duration: int) -> tuple[Array, int]:

@@ -1036,15 +1036,12 @@ def drift_of(model: ModelFit) -> list[Array]:
 
 def shown_by_one_warm_up(model: ModelFit, declared: int) -> tuple[str, ...]:
     """Return the declared effects that the readings show by one warm-up alone."""
-    free = free_warm_ups(model.readings.subset(model.used))
-
-    def own(term: Term) -> NDArray[np.bool_]:
-        place = np.zeros(model.fit.design.shape[1], bool)
-        place[model.place(term)] = True
-        return place
-
-    found = [term for term in model.terms[:declared] if is_shown_by_one_warm_up([model.fit], [own(term)], [free])]
-    return tuple(term.effect for term in found)
+    free, columns = free_warm_ups(model.readings.subset(model.used)), np.arange(model.fit.design.shape[1])
+    return tuple(
+        term.effect
+        for term in model.terms[:declared]
+        if is_shown_by_one_warm_up([model.fit], [np.isin(columns, columns[model.place(term)])], [free])
+    )
 
 
 def coefficients_beside(

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import Readings, known_mean
@@ -145,23 +146,17 @@ def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
     return last
 
 
-def predict_left_out(record: Record, columns: Array, penalty: float, used: NDArray[np.bool_] | None = None) -> Array:
-    """Predict every part of a record, or every run of several, from all others that are `used`, earlier and later ones."""
-    used = np.ones(record.seconds.size, bool) if used is None else used
+def parts_left_out(record: Record, used: NDArray[np.bool_]) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Every part of a record, or every run of several, behind all others that are used, earlier and later ones."""
     numbers = record.run if np.unique(record.run[used]).size > 1 else record.chained
     parts = [numbers == number for number in np.unique(numbers[used])]
-    return _predict_parts(record, columns, penalty, [(used & ~part, part) for part in parts])
+    return [(used & ~part, part) for part in parts]
 
 
-def predict_later(record: Record, columns: Array, penalty: float, train: NDArray[np.bool_]) -> Array:
-    """Predict the later parts of the training blocks from those before them, or every training run from the others; NaN elsewhere."""
-    return _predict_parts(record, columns, penalty, folds(record, train))
-
-
-def _predict_parts(
+def predict_parts(
     record: Record, columns: Array, penalty: float, asked: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]]
 ) -> Array:
-    """Predict parts, each from the blocks that stand before it."""
+    """Predict parts, each from the blocks that stand before it; NaN elsewhere."""
     predicted = np.full(record.displacement.shape, np.nan)
     place = int(np.flatnonzero(penalty == PENALTIES)[0])
     for used, part in asked:
@@ -255,13 +250,9 @@ def mean_course(record: Record, values: Array, train: NDArray[np.bool_]) -> Arra
     place = np.arange(record.seconds.size) - np.asarray(record.first)[record.run]
     predicted = np.zeros(values.shape)
     for run in range(len(record.runs)):
-        others = np.flatnonzero(train & (record.run != run))
-        course: Array = np.full((int(place.max()) + 1, values.shape[1]), np.nan)
-        for at in np.unique(place[others]):
-            course[at] = known_mean(values[others[place[others] == at]], axis=0)
-        for k in range(values.shape[1]):
-            known = np.flatnonzero(np.isfinite(course[:, k]))
-            course[:, k] = np.interp(np.arange(len(course)), known, course[known, k]) if known.size else 0.0
+        others = train & (record.run != run)
+        known = pd.DataFrame(values[others]).groupby(place[others]).mean().reindex(range(int(place.max()) + 1))
+        course = known.interpolate(limit_direction="both").fillna(0.0).to_numpy()
         predicted[record.run == run] = course[place[record.run == run]]
     return predicted
 

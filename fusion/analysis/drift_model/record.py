@@ -13,7 +13,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -61,10 +61,10 @@ from fusion.analysis.drift_model.predictions import (
     folds,
     held_out_errors,
     last_values,
+    parts_left_out,
     plain_predictions,
     predict,
-    predict_later,
-    predict_left_out,
+    predict_parts,
     rmse,
     track_record,
 )
@@ -245,17 +245,14 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
 
 def _estimate(channel: str, seconds: Array, response: Array, design: Array) -> DriftFit:
     """Robust estimate of one channel; where a column differs from others only in outliers, all blocks count alike."""
-    loadings = np.ones((seconds.size, 1))
-    try:
-        return estimate(seconds, loadings, response, design, robust=True)
-    except DriftModelError:
-        pass
-    try:
-        return estimate(seconds, loadings, response, design)
-    except DriftModelError as error:
-        raise RecordError(
-            f'channel "{channel}" cannot be fitted ({error}); leave it, or sensors that hardly move, out of [record]'
-        ) from None
+    for robust in (True, False):
+        try:
+            return estimate(seconds, np.ones((seconds.size, 1)), response, design, robust=robust)
+        except DriftModelError as error:
+            fault = error
+    raise RecordError(
+        f'channel "{channel}" cannot be fitted ({fault}); leave it, or sensors that hardly move, out of [record]'
+    )
 
 
 def _with_levels(record: Record, columns: Array, here: NDArray[np.intp]) -> Array:
@@ -281,24 +278,18 @@ def _leading(columns: Array, used: NDArray[np.bool_], most: int) -> Array:
 
 def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int) -> list[Array]:
     """Simulate displacements in which only the model's drifts and noise act."""
-    noises, shocks = [], []
-    for fit in model.channels:
+    blocks, channels = model.record.displacement.shape
+    pool, shocks = np.zeros((channels, blocks)), np.full((blocks, channels), np.nan)
+    for k, (fit, rows) in enumerate(zip(model.channels, model.rows, strict=True)):
         noise, share = fit.noise()
-        noises.append(noise / np.sqrt(np.maximum(share, 1e-12)))
-        whitened, _ = fit.system.whiten(fit.residual()[:, None])
-        shocks.append(whitened[:, 0])
-    blocks = model.record.seconds.size
-    laid = np.full((blocks, len(noises)), np.nan)
-    for k, rows in enumerate(model.rows):
-        laid[rows, k] = shocks[k]
-    root = np.linalg.cholesky(_correlation(laid) + 1e-6 * np.eye(len(noises)))
-    correlated = rng.standard_normal((2, blocks, draws, len(noises))) @ root.T
+        pool[k, rows] = noise / np.sqrt(np.maximum(share, 1e-12))
+        shocks[rows, k] = fit.system.whiten(fit.residual()[:, None])[0][:, 0]
+    root = np.linalg.cholesky(_correlation(shocks) + 1e-6 * np.eye(channels))
+    correlated = rng.standard_normal((2, blocks, draws, channels)) @ root.T
     picked = rng.integers(0, blocks, (blocks, draws))
     simulated = []
     for k, (fit, rows) in enumerate(zip(model.channels, model.rows, strict=True)):
-        pool = np.zeros(blocks)
-        pool[rows] = noises[k]
-        drawn = pool[picked[rows]] * np.sqrt(fit.system.variance)[:, None]
+        drawn = pool[k, picked[rows]] * np.sqrt(fit.system.variance)[:, None]
         ratios = plausible_ratios(fit, rng, draws=draws)[:, 0]
         first, second = correlated[..., k][:, rows]
         (walk,) = random_walk(fit.system, [(first, second)])
@@ -384,11 +375,6 @@ def _unseen_heat_source(record: Record, near: Candidate | None) -> Iterator[Cand
             yield Candidate(np.column_stack(states), parameters, ("um",) * len(states))
 
 
-def _happened_s(candidate: Candidate) -> float | None:
-    """When an event happened, s since the start; None for an effect that lasts."""
-    return None if candidate.event_s is None else float(candidate.parameters.get("time_s", candidate.event_s))
-
-
 def _periodic_disturbance(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """Waves in time; of several runs none, as nothing says at which phase the next run begins."""
     if record.runs:
@@ -466,20 +452,18 @@ class RecordGrounds:
     def is_admissible(self, candidate: Candidate) -> bool:
         """Whether nothing speaks against a candidate before any fit: it is no event at a switching, and no lag of a noisy sensor."""
         if candidate.event_s is not None:
-            return not self._is_switched(candidate.event_s)
+            return self.at_switching(candidate) is None
         if "sensor" not in candidate.parameters:
             return True
         _, noise, limit = self.noise_of_lag(candidate)
         return noise <= limit
 
-    def _is_switched(self, event_s: float) -> bool:
-        return bool(self._record.switched()[np.searchsorted(self._record.seconds, event_s)])
-
     def at_switching(self, candidate: Candidate) -> float | None:
         """Hours since the start of the switching at which an event happened."""
-        if candidate.event_s is None:
+        if (event_s := candidate.event_s) is None:
             return None
-        return float(_happened_s(candidate) or 0.0) / 3600.0 if self._is_switched(candidate.event_s) else None
+        switched = self._record.switched()[np.searchsorted(self._record.seconds, event_s)]
+        return float(candidate.parameters.get("time_s", event_s)) / 3600.0 if switched else None
 
     def heat_is_logged(self) -> bool:
         """Whether a driver was logged."""
@@ -690,7 +674,8 @@ class RecordProblem(Problem[RecordFit]):
         """Predict every part of the record from all others, by the penalty of the training part."""
         fitted = [term for term in terms if not isinstance(term.candidate, Event)]
         columns, left = columns_of(self.record, fitted), without_events(self.record, terms)
-        return predict_left_out(left, columns, self.predict(terms).penalty) + events_of(self.record, terms)
+        asked = parts_left_out(left, np.ones_like(self.train))
+        return predict_parts(left, columns, self.predict(terms).penalty, asked) + events_of(self.record, terms)
 
     def offer(self, name: str, model: RecordFit, near: Candidate | None) -> list[Candidate]:
         """Candidates of an effect that vary over the training part."""
@@ -966,12 +951,9 @@ class RecordResult(LoopResult):
         """One run, judged by its own errors where it is held out."""
         described, here = self.record.runs[number], self.record.run == number
         time = self.record.time[here]
-        last = declared = final = np.nan
-        word: schema.Verdict | Literal[""] = ""
-        if described.held_out:
-            own = {name: rmse(errors[here[self.is_held_out]]) for name, errors in self.hold_out_errors.items()}
-            last, declared, final = own["last_value"], own["declared"], own["final"]
-            word = self.judge(own, skill_um=final, remains=exceeds_noise(final, self.noise_floor_um, self.noise_share))
+        own = {name: rmse(errors[here[self.is_held_out]]) for name, errors in self.hold_out_errors.items()}
+        last, declared, final = (own[name] for name in ("last_value", "declared", "final"))
+        remains = exceeds_noise(final, self.noise_floor_um, self.noise_share)
         return schema.RunPart(
             file=described.name,
             held_out=described.held_out,
@@ -980,7 +962,7 @@ class RecordResult(LoopResult):
             rmse_persistence_um=last,
             rmse_declared_um=declared,
             rmse_final_um=final,
-            verdict=word,
+            verdict=self.judge(own, skill_um=final, remains=remains) if described.held_out else "",
         )
 
     def described(self, sensor_faults: Sequence[schema.SensorFaultPart]) -> schema.RecordLoop:
@@ -1054,7 +1036,7 @@ def report_steps(
             chained_rmse_before_um=step.round.start_error_um,
             chained_rmse_after_um=step.score.error_um,
             rejected=_rejected(step.round),
-            event_s=_happened_s(term.candidate),
+            event_s=term.candidate.parameters.get("time_s", term.candidate.event_s),
             sizes_um=term.candidate.sizes(record.channels) if isinstance(term.candidate, Event) else {},
         )
         for place, (step, term, squares) in enumerate(
@@ -1306,27 +1288,23 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
         )
     if not readings and not sensors:
         return SensorHealth(table, set_points=set_points)
+    alive = [name for name in names if name not in dead]
 
-    def both_errors(of: xr.Dataset, *beside: str) -> tuple[dict[str, float], dict[str, float]]:
-        used = of.sel(sensor=[name for name in names if name in kept or name in beside])
-        return _declared_errors(used, declared)
+    def errors(of: xr.Dataset, *used: str) -> tuple[dict[str, float], dict[str, float]]:
+        return _declared_errors(of.sel(sensor=[name for name in names if name in used]), declared)
 
-    def errors(of: xr.Dataset, *beside: str) -> dict[str, float]:
-        return both_errors(of, *beside)[0]
+    def followed(of: xr.Dataset, fault: SensorFault, name: str, run: str) -> list[tuple[str, float, float]]:
+        """Channels with their errors with a sensor as it was read, and as it would read without its fault."""
+        read, repaired = (
+            errors(one, *alive, name)[0] for one in (_as_read(of, table, name), _repaired(of, fault, name, run))
+        )
+        return [(channel, error, repaired.get(channel, np.inf)) for channel, error in read.items()]
 
-    kept = [name for name in names if name not in dead]
     learnt = {name for fault, name, run in sensors if _is_learnt(cleaned, fault, run)}
     moved = [one for one in sensors if one[1] in learnt and one[0].kind in {Kind.NO_SIGNAL, Kind.JUMP, Kind.RAMP}]
-
-    def followed(fault: SensorFault, name: str, run: str) -> Iterator[tuple[str, float, float]]:
-        """Channels with their errors with a sensor as it was read, and as it would read without its fault."""
-        repaired = errors(_repaired(cleaned, fault, name, run), name)
-        for channel, error in errors(_as_read(cleaned, table, name), name).items():
-            yield channel, error, repaired.get(channel, np.inf)
-
     computed: dict[str, schema.SensorFaultPart] = {}
     for fault, name, run in moved:
-        for channel, error, beside in followed(fault, name, run) if fault.is_clear else ():
+        for channel, error, beside in followed(cleaned, fault, name, run) if fault.is_clear else ():
             if beside >= _COMPUTED * error and _contains(_as_read(cleaned, table, name), channel, name):
                 same = replace(fault, kind=Kind.COMPUTED, size=np.nan, computed_with=name, quantity="displacement")
                 same = replace(same, ratio=beside / max(error, 1e-12), limit=_COMPUTED)
@@ -1337,53 +1315,45 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
         stays = {"state": "suspected", "reason": "as every displacement is, so that both stay and no cause is named"}
         computed = {name: one.model_copy(update=stays) for name, one in computed.items()}
     proven = {one.computed_with for one in computed.values()}
-    needed = set() if left else proven
-    channels = left or list(computed)
+    channels, needed = left or list(computed), set() if left else proven
     raw, cleaned = table.sel(channel=channels), cleaned.sel(channel=channels)
-    true = set()
-    for fault, name, run in moved:
-        if fault.kind is not Kind.NO_SIGNAL and name not in proven:
-            kept = [other for other in names if other not in {name, *dead}]
-            alone = errors(cleaned) if kept else {}
-            if any(
-                error < _FOLLOWED * min(beside, alone.get(channel, np.inf))
-                for channel, error, beside in followed(fault, name, run)
-            ):
-                true.add(name)
-    sensors = [one for one in sensors if one[1] not in true]
+
+    def is_true(fault: SensorFault, name: str, run: str) -> bool:
+        """Whether a displacement follows what a sensor does."""
+        if name not in learnt - proven or fault.kind not in {Kind.JUMP, Kind.RAMP}:
+            return False
+        others = [other for other in alive if other != name]
+        alone = errors(cleaned, *others)[0] if others else {}
+        return any(
+            error < _FOLLOWED * min(beside, alone.get(channel, np.inf))
+            for channel, error, beside in followed(cleaned, fault, name, run)
+        )
+
+    sensors = [one for one in sensors if not is_true(*one)]
+    out = {name for fault, name, _ in sensors if fault.is_clear and name not in needed}
+    kept = [name for name in names if name not in out] or alive
     # A sensor is put back while the displacements are predicted better with it, in either way.
-    out = {name: fault for fault, name, _ in sensors if fault.is_clear and name not in needed}
-    kept = [name for name in names if name not in out]
-    if not kept:
-        kept = [name for name in names if name not in dead]
     while True:
-        without, left_out = map(_mean, both_errors(cleaned))
-        asked, better = {}, {}
-        for name in (name for name in names if name in learnt - dead - proven - {*kept}):
-            asked[name], beside = map(_mean, both_errors(cleaned, name))
-            better[name] = min(asked[name] / max(without, 1e-12), beside / max(left_out, 1e-12))
+        without = np.array([_mean(one) for one in errors(cleaned, *kept)])
+        left_out = [name for name in names if name in learnt - dead - proven - {*kept}]
+        asked = {name: np.array([_mean(one) for one in errors(cleaned, *kept, name)]) for name in left_out}
+        better = {name: float(np.fmin(*(one / np.maximum(without, 1e-12)))) for name, one in asked.items()}
         best = min(better, key=lambda name: better[name], default="")
         if not best or not better[best] < 1.0:
             break
         kept = [*kept, best]
     found = []
-    if readings:
-        before, after = errors(raw), errors(cleaned)
-        found = [
-            _part(fault, name, run, before.get(name, _mean(before)), after.get(name, _mean(after)))
-            for fault, name, run in readings
-            if name in channels or name in kept
-        ]
+    before, after = (errors(of, *kept)[0] for of in (raw, cleaned)) if readings else ({}, {})
+    for fault, name, run in readings:
+        if name in channels or name in kept:
+            both = (of.get(name, _mean(of)) for of in (before, after))
+            found.append(_part(fault, name, run, *both))
     for fault, name, run in sensors:
         if fault.is_clear and name in kept:
-            reason = (
-                "every displacement is computed with it"
-                if name in needed
-                else "the displacements are predicted no better without it"
-            )
+            computed_with = "every displacement is computed with it"
+            reason = computed_with if name in needed else "the displacements are predicted no better without it"
             fault = replace(fault, is_clear=False, reason=reason)
-        both = (asked[name], without) if name in asked else ()
-        found.append(_part(fault, name, run, *both))
+        found.append(_part(fault, name, run, *((asked[name][0], without[0]) if name in asked else ())))
     sound = cleaned.sel(sensor=[name for name in names if name in kept])
     return SensorHealth(sound, (*computed.values(), *found), bool(left), set_points)
 
@@ -1526,7 +1496,7 @@ def _declared_errors(table: xr.Dataset, declared: Sequence[str]) -> tuple[dict[s
     columns = columns_of(record, declare(declared, record))
     penalty = predict(record, columns, train).penalty
     later, others = (
-        channel_rmse(record.displacement - predict_parts(record, columns, penalty, train)).tolist()
-        for predict_parts in (predict_later, predict_left_out)
+        channel_rmse(record.displacement - predict_parts(record, columns, penalty, asked)).tolist()
+        for asked in (folds(record, train), parts_left_out(record, train))
     )
     return dict(zip(record.channels, later, strict=True)), dict(zip(record.channels, others, strict=True))

@@ -131,15 +131,15 @@ class Record:
     displacement: Array
     temperature: Array
     temperature_noise: Array
-    digits: Mapping[str, float]
     displacement_step: Array
     temperature_step: Array
     drivers: Mapping[str, Mapping[int, Array]]
     channels: tuple[str, ...]
     sensors: tuple[str, ...]
-    duplicates: tuple[str, ...]
     chained: NDArray[np.int64]
-    gaps: Mapping[str, int]
+    digits: Mapping[str, float] = field(default_factory=dict)
+    duplicates: tuple[str, ...] = ()
+    gaps: Mapping[str, int] = field(default_factory=dict)
     impossible: Mapping[str, int] = field(default_factory=dict)
     unusable: Mapping[str, str] = field(default_factory=dict)
     runs: tuple[RecordedRun, ...] = ()

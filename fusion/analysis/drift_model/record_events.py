@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
@@ -220,7 +221,10 @@ class _Cells:
             place = np.round((samples.seconds[rows] - samples.seconds[rows[0]]) / step).astype(int)
             number = int(place[-1]) + 1
             seconds = samples.seconds[rows[0]] + step * np.arange(number)
-            response, moved = (_means(values[rows], place, number) for values in (samples.displacement, samples.moved))
+            response, moved = (
+                np.array(pd.DataFrame(values[rows]).groupby(place).mean().reindex(range(number)), order="C")
+                for values in (samples.displacement, samples.moved)
+            )
             for column in moved.T:
                 known = np.isfinite(column)
                 column[:] = np.interp(seconds, seconds[known], column[known]) if known.any() else 0.0
@@ -325,7 +329,8 @@ class _Cells:
         best = looked.best(channels)
         size, u = looked.sizes(best)
         onset, duration, u_course = looked.intervals(best, channels)
-        if onset.low <= looked.earliest_s:
+        # What began before the first onset that was tried has no onset here.
+        if onset.low <= looked.courses[0].onset_s:
             return None
         return Event(
             columns=np.empty((0, 1)),
@@ -446,16 +451,6 @@ class _Look:
             gain[:, k] /= max(1.0, misfit)
         return cls(seconds.mean(axis=1), seconds, spacing, courses, gain, size, parts, whitened)
 
-    @property
-    def width_s(self) -> float:
-        """How long it is, s."""
-        return self.seconds.size * self.spacing_s
-
-    @property
-    def earliest_s(self) -> float:
-        """The first onset that was tried, s: what began before has no onset here."""
-        return self.courses[0].onset_s
-
     def best(self, channels: list[int]) -> Course:
         """The course that fits these channels best, with the share at once that the one which shows it most has."""
         parts = np.array([one.at_once > 0.0 for one in self.courses])
@@ -518,19 +513,8 @@ def _is_settled(
 ) -> bool:
     """Whether a longer look at a change makes it no larger."""
     looked, course, size, u = shorter
-    room = course.duration_s < 0.3 * looked.width_s
+    room = course.duration_s < 0.3 * looked.seconds.size * looked.spacing_s
     return room and bool(np.abs(longer[2] - size)[channel] < _SAME_SIZE * max(u[channel], longer[3][channel]))
-
-
-def _means(values: Array, place: NDArray[np.intp], number: int) -> Array:
-    """Means of values (n, columns) in every cell, NaN where there is none."""
-    means = np.full((number, values.shape[1]), np.nan)
-    for k, column in enumerate(values.T):
-        known = np.isfinite(column)
-        count = np.bincount(place[known], minlength=number)
-        total = np.bincount(place[known], column[known], minlength=number)
-        means[:, k] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return means
 
 
 def _changes(values: Array, gap: int, mean: int) -> Array:

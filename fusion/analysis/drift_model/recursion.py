@@ -93,13 +93,11 @@ def record_of_product(product: xr.Dataset) -> Record:
     """Return the record on its blocks as ``fusion.nc`` holds it."""
     if "driver_square" not in product:
         raise RecursionError("these results were written by an earlier version; run the campaign again")
-    drivers = {
-        str(name): {
-            exponent: product[variable].values[:, k]
-            for exponent, variable in zip(EXPONENTS, ("driver", "driver_square"), strict=True)
-        }
-        for k, name in enumerate(product["driver_name"].values)
-    }
+    drivers, sizes = {}, {}
+    for k, name in enumerate(product["driver_name"].values.tolist()):
+        powers = (product[variable].values[:, k] for variable in ("driver", "driver_square"))
+        drivers[name] = dict(zip(EXPONENTS, powers, strict=True))
+        sizes[name] = float(product["driver_size"][k]), str(product["driver_units"].values[k])
     time = product["time"].values
     run = product["run"].values if "run" in product else np.ones(time.size, int)
     sensors = [str(name) for name in product["sensor"].values]
@@ -110,25 +108,14 @@ def record_of_product(product: xr.Dataset) -> Record:
         displacement=product["displacement"].values,
         temperature=product["temperature"].values,
         temperature_noise=np.zeros(len(sensors)),
-        digits={},
         displacement_step=np.zeros(product.sizes["channel"]),
         temperature_step=np.zeros(len(sensors)),
         drivers=drivers,
         channels=tuple(str(name) for name in product["channel"].values),
         sensors=tuple(sensors),
-        duplicates=(),
         chained=product["part"].values - 1,
-        gaps={},
         first=tuple(np.flatnonzero(np.diff(run, prepend=run[0] - 1)).tolist()),
-        driver_sizes={
-            str(name): (float(size), str(unit))
-            for name, size, unit in zip(
-                product["driver_name"].values,
-                product["driver_size"].values,
-                product["driver_units"].values,
-                strict=True,
-            )
-        },
+        driver_sizes=sizes,
     )
 
 
