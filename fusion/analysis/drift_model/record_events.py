@@ -415,11 +415,9 @@ class _Look:
             if share * width >= 2.0 * spacing or not (share or settles)
         ]
         columns = np.column_stack([one.at(seconds.ravel()).reshape(number, group).mean(axis=1) for one in courses])
-        instants = {float(onset): k for k, onset in enumerate(onsets)}
-        steps = np.column_stack(
-            [Course(float(onset), 0.0).at(seconds.ravel()).reshape(number, group).mean(axis=1) for onset in onsets]
-        )
-        place = np.array([instants[one.onset_s] for one in courses])
+        # Every onset stands for a change at once as well.
+        steps = columns[:, [not one.duration_s for one in courses]]
+        place = np.searchsorted(onsets, [one.onset_s for one in courses])
         two = np.array([one.at_once > 0.0 for one in courses])
         gain, size, parts = (np.zeros((len(courses), values.shape[1])) for _ in range(3))
         whitened = []
@@ -559,11 +557,7 @@ def _log_p(excursions: Array, width: int) -> tuple[int, float]:
     """
     excursions = excursions**_TAIL
     windows = excursions.size // width
-    padded = (
-        np.nan_to_num(excursions[: windows * width], nan=-1.0).reshape(windows, width).max(axis=1)
-        if windows
-        else excursions[:0]
-    )
+    padded = np.nan_to_num(excursions[: windows * width], nan=-1.0).reshape(windows, width).max(axis=1)
     largest = np.sort(padded[padded >= 0.0])[::-1]
     at = int(np.nanargmax(excursions)) if np.isfinite(excursions).any() else 0
     above = largest.size // 2
