@@ -17,7 +17,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import known_mean
-from fusion.analysis.drift_model.model import plausible_ratios
 from fusion.analysis.drift_model.predictions import (
     BASELINE_LAGS_MIN,
     PENALTIES,
@@ -27,7 +26,7 @@ from fusion.analysis.drift_model.predictions import (
     last_values,
     rmse,
 )
-from fusion.analysis.drift_model.record_data import EXPONENTS, Record, independent
+from fusion.analysis.drift_model.record_data import EXPONENTS, Record
 from fusion.common import Array
 from fusion.results import loop as schema
 from fusion.results.loop import RecordLoop
@@ -40,7 +39,6 @@ from fusion.results.recursion import (
     SensorCurvePoint,
     first_order_weights,
 )
-from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
 from interferometry.drift.kalman import drift_system
 
 #: A reduced model may predict worse than that of all sensors by this share.
@@ -311,12 +309,14 @@ def follow(
     return found
 
 
-def _later_parts(record: Record, used: NDArray[np.bool_]) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Blocks that are predicted for a choice and those before them: the later half in equal parts, or runs and all others."""
+def _later_parts(
+    record: Record, used: NDArray[np.bool_], number: int = _PARTS
+) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Blocks that are predicted and those before them: the later half of so many equal parts, or runs and all others."""
     if np.unique(record.run[used]).size > 1:
         return [(before, part) for before, part in folds(record, used) if before.any() and part.any()]
-    parts = [np.isin(np.arange(used.size), rows) for rows in np.array_split(np.flatnonzero(used), _PARTS) if rows.size]
-    return [(np.logical_or.reduce(parts[:k]), parts[k]) for k in range(_PARTS // 2, len(parts))]
+    parts = [np.isin(np.arange(used.size), rows) for rows in np.array_split(np.flatnonzero(used), number) if rows.size]
+    return [(np.logical_or.reduce(parts[:k]), parts[k]) for k in range(number // 2, len(parts))]
 
 
 def _regress(record: Record, courses: Array, values: Array, events: Array, used: NDArray[np.bool_]) -> Array:
@@ -347,52 +347,40 @@ def errors_of(record: Record, values: Array, following: Sequence[Following], use
     return np.column_stack([_from_last_values(record, one[:, None], used) for one in missed.T])
 
 
-def _wandering(seconds: Array, missed: Array, events: Array) -> DriftFit:
-    """Random walk and noise of what is missed (n,) beside events (events, n); what is followed exactly gets a millionth of its range."""
-    one = np.ones((seconds.size, 1))
-    size = max(1e-6 * float(np.ptp(missed)), 1e-9)
-    shaken = missed - missed.mean() + size * np.random.default_rng(0).standard_normal(seconds.size)
-    design = np.column_stack([one, *(each for each in events if np.ptp(each) > 0.0)])
-    return estimate(seconds, one, shaken, design[:, [0, *(1 + k for k in independent(design[:, 1:]))]], order=1)
-
-
 def _drawn_errors(
     record: Record,
     course: Array,
     values: Array,
     events: Array,
     one: Following,
+    response: Response,
     used: NDArray[np.bool_],
     *,
     seed: int = 1,
 ) -> Array:
-    """Errors (blocks, draws), um, of predicting simulated courses of one displacement of a single run.
+    """Errors (blocks, draws), um, of predicting simulated courses of one displacement of a single run from those before the hold-out.
 
-    They wander as what was missed leaves possible, and are predicted with coefficients of their own. What later parts were missed by beyond
-    that, because the response is another one, enlarges them.
+    They respond and wander as the training time leaves possible, and are predicted with coefficients of their own. What later parts of it,
+    as long as the hold-out, were missed by beyond that enlarges them.
     """
-    fit = _wandering(record.seconds[used], course[used] - values[used] @ one.coefficients, events[:, used])
     # The same draws for all: the drifts of the channels of one machine are alike.
-    rng = np.random.default_rng(seed)
-    ratios, place = np.unique(plausible_ratios(fit, rng, draws=_DRAWS)[:, 0], return_inverse=True)
-    sigma = np.array(
-        [
-            fit_fixed_effects(replace(fit.system, ratios=np.array([one])), fit.response, fit.design).sigma
-            for one in ratios
-        ]
+    rng, shape = np.random.default_rng(seed), (record.seconds.size, _DRAWS)
+    steps = np.sqrt(response.ratio * np.diff(record.seconds, prepend=record.seconds[0]))[:, None]
+    drawn = response.noise_um * (np.cumsum(steps * rng.standard_normal(shape), axis=0) + rng.standard_normal(shape))
+    sizes, directions = np.linalg.eigh(response.covariance)
+    open_ = directions * np.sqrt(np.maximum(sizes, 0.0)) @ rng.standard_normal((sizes.size, _DRAWS))
+    drawn += values @ (response.coefficients[:, None] + open_)
+
+    def missed(courses: Array, known: NDArray[np.bool_]) -> Array:
+        fitted = _regress(record, courses, values[:, one.kept], events, known)[one.penalty == _PENALTIES][0]
+        return _from_last_values(record, courses - values[:, one.kept] @ fitted, known)
+
+    ahead = _later_parts(record, used, int(np.clip(used.sum() // (~used).sum(), 2, _PARTS)))
+    measured, expected = (
+        np.mean([np.mean(missed(courses, before)[part] ** 2) for before, part in ahead])
+        for courses in (course[:, None], drawn)
     )
-    steps = np.sqrt(np.diff(record.seconds, prepend=record.seconds[0]))[:, None]
-    shape = (record.seconds.size, _DRAWS)
-    walk = np.sqrt(ratios[place]) * np.cumsum(steps * rng.standard_normal(shape), axis=0)
-    drawn = (values @ one.coefficients)[:, None] + sigma[place] * (walk + rng.standard_normal(shape))
-
-    def missed(known: NDArray[np.bool_]) -> Array:
-        fitted = _regress(record, drawn, values[:, one.kept], events, known)[one.penalty == _PENALTIES][0]
-        return _from_last_values(record, drawn - values[:, one.kept] @ fitted, known)
-
-    parts = _later_parts(record, used)
-    expected_um = np.sqrt(np.mean([np.mean(missed(before)[part] ** 2) for before, part in parts]))
-    return missed(used) * max(1.0, one.missed_um / expected_um)
+    return missed(drawn, used) * np.sqrt(max(1.0, measured / expected))
 
 
 @dataclass(frozen=True)
@@ -423,12 +411,14 @@ def forecast(record: Record, events: Array, train: NDArray[np.bool_]) -> Anchore
         return None
     columns = columns_of(record, record.sensors)
     values = evaluate_columns(record, columns)
-    following = follow(record, columns, values, events, train)
+    following, responses = follow(record, columns, values, events, train), respond(record, values, events, train)
     errors = np.where(train[:, None], np.nan, errors_of(record, values, following, train))
     drawn = np.array(
         [
-            _drawn_errors(record, course, values, events[..., k], following[k], train & np.isfinite(course))[~train].T
-            for k, course in enumerate(record.displacement.T)
+            _drawn_errors(record, course, values, events[..., k], following[k], response, train & np.isfinite(course))[
+                ~train
+            ].T
+            for k, (course, response) in enumerate(zip(record.displacement.T, responses, strict=True))
         ]
     ).transpose(1, 2, 0)
     known = np.where(np.isfinite(errors[~train]), drawn, np.nan)
