@@ -280,6 +280,8 @@ _RAILS_DEGC = (-270.0, -250.0, -242.0, -200.0, -180.0, -127.0, 850.0, 999.0, 137
 #: Something is heated, and no fault, that holds a level for half the time in which it is so much warmer than most others and than itself
 #: at its coldest, K.
 _HEATED_K = 15.0
+#: A set point, in whole halves of a degree, is this high at most, degC.
+_HEATED_DEGC = 500.0
 #: A signal ends where the last share of the record is missing.
 _ENDED_SHARE = 0.02
 #: Equal readings in a row from which a sensor may stick.
@@ -507,7 +509,8 @@ def examine_readings(
 def no_readings(values: Array) -> NDArray[np.bool_]:
     """Numbers (n,) of a temperature sensor that are none of a temperature: beyond what can be measured, or at the rail of an input.
 
-    A rail is one number that lies far from all other readings, documented, or repeated to the last digit far longer than any of them.
+    A rail is one number that lies far from all other readings, documented, or repeated to the last digit far longer than any of them; above
+    all others it may as well be the level at which a heater is held, between two readings that are far apart.
     """
     with np.errstate(invalid="ignore"):
         none = ~((values >= MEASURABLE_DEGC[0]) & (values <= MEASURABLE_DEGC[1])) & np.isfinite(values)
@@ -524,7 +527,8 @@ def no_readings(values: Array) -> NDArray[np.bool_]:
     rest = known[known != known[first]]
     if rest.size and length > excursion_limit(1) * max(ordinary, _LEAST_REPEATED / _MOVES):
         away_K = float(np.abs(rest - known[first]).min())
-        if away_K > max(_RAIL_K, float(np.ptp(rest))):
+        is_level = rest.max() < known[first] <= _HEATED_DEGC and known[first] / _SET_STEP_K % 1.0 == 0.0
+        if away_K > max(_RAIL_K, float(np.ptp(rest))) and not is_level:
             none |= values == known[first]
     return none
 
@@ -593,8 +597,10 @@ def _stuck(
         run = known[first : first + length]
         others = [j for j in kept if j != k]
         moving = [j for j in others if np.ptp(temperature[run, j]) != 0.0]
-        # A logger that stands still repeats all of them.
-        if others and len(moving) <= 0.5 * len(others):
+        # A logger that stands still repeats all of them, and what is heated holds its level.
+        if (others and len(moving) <= 0.5 * len(others)) or is_heated(temperature[:, k], temperature[:, others])[
+            run
+        ].all():
             continue
         first_s, last_s = float(seconds[run[0]]), float(seconds[run[-1]])
         inside = (grid.seconds >= first_s) & (grid.seconds <= last_s)
@@ -780,14 +786,12 @@ def _noisier(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]
     if size < _NOISE_SAMPLES:
         return []
     scale = np.full((_NOISE_WINDOWS, len(kept)), np.nan)
-    for place, k in enumerate(kept):
-        digits = np.diff(np.unique(temperature[np.isfinite(temperature[:, k]), k]))
+    for place, column in enumerate(temperature[:, kept].T):
+        digits = np.diff(np.unique(column[np.isfinite(column)]))
         least = float(digits.min(initial=np.inf)) / np.sqrt(12.0)
-        for window in range(_NOISE_WINDOWS):
-            values = temperature[window * size : (window + 1) * size, k]
-            values = values[np.isfinite(values)]
-            if values.size - 2 >= _NOISE_SAMPLES // 2:
-                scale[window, place] = max(sample_noise(values), least)
+        for window, some in enumerate(column[: _NOISE_WINDOWS * size].reshape(_NOISE_WINDOWS, size)):
+            if np.isfinite(some).sum() - 2 >= _NOISE_SAMPLES // 2:
+                scale[window, place] = max(sample_noise(some[np.isfinite(some)]), least)
     with np.errstate(all="ignore"):
         course = np.log(scale) - np.log(np.nanmedian(scale, axis=0))
     limit = excursion_limit(len(kept))
