@@ -1,8 +1,7 @@
 """How often the loop on a record is right, on records of the twin: docs/method/records.md, table of error rates.
 
-THERMOFUSE_RUNS sets the number of records per case (30 by default; 12 behind the quoted figures), THERMOFUSE_FIRST_SEED the first seed.
-This test runs the search and the opening of the hold-out; the quoted figures are of the whole loop, which also withdraws an effect that
-did not help on earlier parts of the record.
+THERMOFUSE_RUNS sets the number of records per case (30 by default), THERMOFUSE_FIRST_SEED the first seed. This test runs the search and
+the opening of the hold-out; the whole loop also withdraws an effect that did not help on earlier parts of the record.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import pytest
 from fusion.analysis.drift_model.record import ask_unseen, declare, hold_out, search_record, series_of
 from fusion.analysis.drift_model.record_data import reduce_record
 from fusion.analysis.drift_model.search import open_hold_out
+from fusion.analysis.levels import RECORD_ENTRY_LEVEL
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import twin_table
 from tests.soak.rates import campaigns, first_seed, rate, wilson
@@ -38,7 +38,7 @@ def test_rates_of_names_on_records(capsys: pytest.CaptureFixture[str]) -> None:
     wrong, rows = {}, []
     for kind, effect in KINDS.items():
         names: Counter[tuple[str, ...]] = Counter()
-        before, after = [], []
+        before, after, unnamed = [], [], 0
         for seed in range(FIRST_SEED, FIRST_SEED + RUNS):
             record = reduce_record(twin_table(*([effect] if effect else []), seed=seed))
             train, _ = hold_out(record)
@@ -46,11 +46,13 @@ def test_rates_of_names_on_records(capsys: pytest.CaptureFixture[str]) -> None:
             names[tuple(step.effect for step in state.steps)] += 1
             before.append(state.errors_um[0])
             after.append(state.errors_um[-1])
+            unnamed += bool(state.unnamed(RECORD_ENTRY_LEVEL))
         right = sum(count for found_names, count in names.items() if found_names == ((kind,) if effect else ()))
         wrong[kind] = sum(count for found_names, count in names.items() if set(found_names) - {kind})
         rows.append(
             f"{kind:22s} right alone {right}/{RUNS}, a wrong name {wrong[kind]}/{RUNS}, "
-            f"hold-out error {np.median(before):.2f} -> {np.median(after):.2f} um   {dict(names)}"
+            f"significant without a name {unnamed}/{RUNS}, hold-out error {np.median(before):.2f} -> {np.median(after):.2f} um, larger in "
+            f"{np.greater(after, before).sum()}/{RUNS}   {dict(names)}"
         )
     with capsys.disabled():
         print("\n" + "\n".join(rows))
