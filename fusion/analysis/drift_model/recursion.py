@@ -415,12 +415,10 @@ def forecast(record: Record, events: Array, train: NDArray[np.bool_]) -> Anchore
     errors = np.where(train[:, None], np.nan, errors_of(record, values, following, train))
     drawn = np.array(
         [
-            _drawn_errors(record, course, values, events[..., k], following[k], response, train & np.isfinite(course))[
-                ~train
-            ].T
-            for k, (course, response) in enumerate(zip(record.displacement.T, responses, strict=True))
+            _drawn_errors(record, course, values, events[..., k], one, response, train & np.isfinite(course))
+            for k, (course, one, response) in enumerate(zip(record.displacement.T, following, responses, strict=True))
         ]
-    ).transpose(1, 2, 0)
+    )[:, ~train].transpose(2, 1, 0)
     known = np.where(np.isfinite(errors[~train]), drawn, np.nan)
     u = np.full(errors.shape, np.nan)
     u[~train] = np.sqrt(np.mean(drawn**2, axis=0))
