@@ -103,9 +103,9 @@ def plot_field(course: Course) -> Chart | None:
         return None
     number, shown = course.with_field.number, course.with_field.field
     low, high = course.field_range_degC
-    extent = extent_of(shown.to_dataset(name="temperature"))
-    drawn = draw_map(shown.values, extent, LAYERS[1], {"low": low, "high": max(high, low + 0.1)})
-    to_scale(drawn, extent)
+    scale = {"low": low, "high": max(high, low + 0.1)}
+    drawn = draw_map(shown.values, extent_of(shown.to_dataset(name="temperature")), LAYERS[1], scale)
+    to_scale(drawn)
     seen = f"Temperature of the table in cycle {number}: {span_words(shown, '°C')}."
     return Chart(drawn, seen, {})
 

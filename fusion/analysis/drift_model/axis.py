@@ -850,9 +850,12 @@ class AxisResult(LoopResult):
 
     def _summary(self) -> list[tuple[str, str]]:
         """What `LoopResult` tells, led by the coefficients with U (k = 2), which holds what one target or part of the test moves."""
-        found = [(one.effect, one, one.jackknife_u) for one in self.declared_coefficients]
-        found += [(step.effect, one, None) for step in self.steps for one in step.coefficients]
-        told = [(name, measured(c.value, np.fmax(c.u, moved or 0.0), print_unit(c.unit))) for name, c, moved in found]
+        told = [
+            (one.effect, measured(one.value, max(one.u or 0.0, one.jackknife_u or 0.0), print_unit(one.unit)))
+            for one in self.declared_coefficients
+        ]
+        for step in self.steps:
+            told += [(step.effect, measured(one.value, one.u, print_unit(one.unit))) for one in step.coefficients]
         return [*told, *super()._summary()]
 
     def described(

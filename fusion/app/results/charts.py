@@ -14,7 +14,7 @@ from bokeh.models import ColorBar, ColumnDataSource, HoverTool, LinearColorMappe
 from bokeh.plotting import figure
 
 from fusion.app import parts as ui
-from fusion.app.drawings import add_cross, keep_scale, shown_drawing
+from fusion.app.drawings import keep_scale, shown_drawing
 from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Products, Selection
 from fusion.campaign.inputs import lacks_course
 from fusion.report.campaign import (
@@ -27,7 +27,7 @@ from fusion.report.campaign import (
     steps_table,
 )
 from fusion.report.charts import readings
-from fusion.report.charts.plan import Extent, Layer, draw_followed, draw_map, draw_places, extent_of
+from fusion.report.charts.plan import Layer, add_marks, draw_followed, draw_map, draw_places, extent_of
 from fusion.report.charts.readings import cycle_map
 from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_series, new_figure, of_rank, palette
@@ -45,7 +45,7 @@ from fusion.results.axis import AnomalyPart
 from fusion.results.loop import AxisLoop, RecordLoop
 from fusion.results.numbers import join, moment, number, p_words, place
 from fusion.results.store import DamagedProductError, group, has
-from interferometry.plots import ACCENT, INK, hours_since_start
+from interferometry.plots import ACCENT, hours_since_start
 
 
 def shown(chart: Chart, caption: str) -> pn.viewable.Viewable:
@@ -260,8 +260,6 @@ def effects_left(stored: xr.Dataset, loop: AxisLoop, entered: int) -> xr.DataArr
 
 #: Milliseconds from cycle to cycle while it plays.
 _PLAY_MS = 400
-#: Free margin around a plan, as a share of its longer side.
-_MARGIN = 0.02
 #: Most places whose temperature is shown over time.
 _MOST_PLACES = 8
 
@@ -340,8 +338,8 @@ class ThermalView:
         correlation = results.correlation
         if correlation is not None and correlation.verdict == "attributable" and correlation.source.area is not None:
             draw_followed(drawn, correlation.source.area)
-        to_scale(drawn, extent_of(fields))
-        draw_ring(drawn, self._chosen)
+        to_scale(drawn)
+        add_marks(drawn, "x", "y", "circle", 15, source=self._chosen)
         square = {"marker": "square", "size": 11, "fill_color": "colour", "line_color": "#ffffff", "line_width": 1.5}
         drawn.scatter("x", "y", source=self._marks, **square)
         return drawn
@@ -387,8 +385,9 @@ class ThermalView:
 
     def _show_target(self) -> None:
         """Ring the chosen position."""
-        at = target_place(self._fields, self._selection.target)
-        self._chosen.data = {"x": [], "y": []} if at is None else {"x": [at[0]], "y": [at[1]]}
+        fields = self._fields
+        seen = [one for one in fields["target"].values if one == self._selection.target] if "target_x" in fields else []
+        self._chosen.data = {axis: fields[f"target_{axis}"].sel(target=seen).values if seen else [] for axis in "xy"}
 
     def _add_place(self, x_mm: float | None, y_mm: float | None) -> None:
         """Add a place inside the plan, as far as there are colours left."""
@@ -431,27 +430,9 @@ class ThermalView:
         self._history[:] = [shown_drawing(drawn), seen]
 
 
-def to_scale(drawn: figure, extent: Extent) -> None:
-    """Show the plan to scale with a margin, y downwards as the camera sees it."""
-    left, right, bottom, top = extent
-    if left <= 0 <= right and bottom <= 0 <= top:
-        add_cross(drawn, 0.0, 0.0)
-    margin = _MARGIN * max(right - left, top - bottom)
-    keep_scale(drawn, (left - margin, right + margin), (top + margin, bottom - margin))
-
-
-def draw_ring(drawn: figure, source: ColumnDataSource) -> None:
-    """Ring a position, to be seen on any colour."""
-    for colour, width in ((INK, 5), ("#ffffff", 2.5)):
-        drawn.scatter("x", "y", source=source, marker="circle", size=15, fill_color=None, line_color=colour, line_width=width)  # fmt: skip
-
-
-def target_place(fields: xr.Dataset | None, target: int | None) -> tuple[float, float] | None:
-    """Return the place of a target on the plan (x, y), mm or px; None where the camera did not see it."""
-    if fields is None or target is None or "target_x" not in fields or target not in fields["target"].values:
-        return None
-    here = fields[["target_x", "target_y"]].sel(target=target)
-    return float(here["target_x"]), float(here["target_y"])
+def to_scale(drawn: figure) -> None:
+    """Show a map of the report to scale in whatever width the page has."""
+    keep_scale(drawn, *((ends.start, ends.end) for ends in (drawn.x_range, drawn.y_range)))
 
 
 # Positions that stand out, as cards below the scatter of every position.

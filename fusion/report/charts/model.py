@@ -10,7 +10,7 @@ from bokeh.models import FixedTicker, LinearColorMapper
 from bokeh.plotting import figure
 
 from fusion.analysis.levels import ATTRIBUTION_LEVEL
-from fusion.report.charts.plan import Extent, add_cells, extent_of, new_plan
+from fusion.report.charts.plan import Extent, add_cells, add_marks, extent_of, new_plan
 from fusion.report.charts.style import (
     BEFORE,
     CATEGORIES,
@@ -29,7 +29,7 @@ from fusion.report.charts.style import (
 )
 from fusion.report.wording import CHANNELS, effect_words, region_words
 from fusion.results.numbers import alike, duration, number, p_cell, p_words
-from interferometry.plots import COLOURS, INK, hours_since_start
+from interferometry.plots import COLOURS, hours_since_start
 
 # Maps and charts of the correlation: sensitivity and significance of cells, thermal modes, regions by target.
 
@@ -115,8 +115,7 @@ def plot_mode(modes: xr.Dataset, mode: int, channel: str, least_p: float | None 
     pattern = one["pattern"].values
     add_cells(drawn, pattern, extent, mapper, [("warming relative to the cross", "@image{0.00}")])
     x, y = float(one["at_x"]), float(one["at_y"])
-    for colour, width in (("#ffffff", 5), (INK, 2)):
-        drawn.scatter([x], [y], marker="cross", size=14, line_color=colour, line_width=width)
+    add_marks(drawn, [x], [y], "cross", 14)
     add_colour_bar(drawn, mapper, "warming relative to the cross")
     seen = (
         f"Thermal mode {mode}, strongest at x {x:.0f} mm, y {y:.0f} mm; it {'correlates' if significant else 'does not correlate'} with "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -145,9 +145,9 @@ def plot_registration(
     rings = drawn.scatter("column", "row", source=source, **looks)
     add_names(drawn, "column", "row", "name", source=source, x_offset=9, y_offset=-4)
     if "target_x" in fields:
-        _draw_both(drawn.line, *_to_frame(fields, fields["target_x"].values, fields["target_y"].values))
+        draw_both(drawn, *_to_frame(fields, fields["target_x"].values, fields["target_y"].values))
     if followed is not None:
-        _draw_both(drawn.line, *_to_frame(fields, *_rim(followed)))
+        draw_both(drawn, *_to_frame(fields, *_rim(followed)))
     for spot in hotspots:
         at = _to_frame(fields, np.array([spot.x_mm]), np.array([spot.y_mm]))
         add_marks(drawn, *at, "circle", 19)
@@ -187,10 +187,10 @@ def _rim(area: AreaPart) -> tuple[np.ndarray, np.ndarray]:
     return np.interp(share, corners, x), np.interp(share, corners, y)
 
 
-def _draw_both(draw: Callable[..., Any], x: np.ndarray, y: np.ndarray) -> None:
-    """Draw dark under light, which reads on every colour."""
+def draw_both(drawn: figure, x: np.ndarray, y: np.ndarray) -> None:
+    """Draw a line dark under light, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 1.6)):
-        draw(x, y, line_color=colour, line_width=width)
+        drawn.line(x, y, line_color=colour, line_width=width)
 
 
 def _on_plan(fields: xr.Dataset, shape: tuple[int, ...]) -> np.ndarray:
@@ -422,7 +422,7 @@ def plot_thermal_map(
 
 def draw_followed(drawn: figure, area: AreaPart) -> None:
     """Draw the area whose temperature the drift follows."""
-    _draw_both(drawn.line, *_rim(area))
+    draw_both(drawn, *_rim(area))
     middle = (area.x_low_mm + area.x_high_mm) / 2
     place = {"y_offset": 2, "text_baseline": "top", "text_align": "center"}
     add_names(drawn, [middle], [area.y_high_mm], ["the drift follows this"], **place)
@@ -558,12 +558,10 @@ def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
         add_names(drawn, x, y, names, y_offset=16, text_align="center", text_baseline="middle")
 
 
-def add_marks(
-    drawn: figure, x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray, marker: str, size: int
-) -> None:
+def add_marks(drawn: figure, x: Any, y: Any, marker: str, size: int, **options: Any) -> None:
     """Draw hollow marks, light on dark, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 2)):
-        drawn.scatter(x, y, marker=marker, size=size, fill_color=None, line_color=colour, line_width=width)
+        drawn.scatter(x, y, marker=marker, size=size, fill_color=None, line_color=colour, line_width=width, **options)
 
 
 def _seen(

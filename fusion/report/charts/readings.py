@@ -118,10 +118,8 @@ def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Se
         row = drift.sel(direction=direction)
         value = row["scatter"].values
         low, high = scatter_limits(value, row["scatter_freedom"].values, float(drift["sigma"]))
-        name, looks = (
-            ARROWS[direction],
-            {"line": False, "half": np.stack([value - low, high - value]), **of_direction(direction)},
-        )
+        name, half = ARROWS[direction], np.stack([value - low, high - value])
+        looks = {"line": False, "half": half, **of_direction(direction)}
         courses.add(x + shift * step, value, name, f"scatter, {name} / µm", f"95 % limits, {name} / µm", **looks)
         highest = np.fmax(highest, np.fmax.reduce(high))
     fix_range(drawn, 0.0, 1.06 * highest if highest else 1.0)
@@ -190,13 +188,8 @@ def plot_test(quoted: xr.Dataset, position: xr.DataArray) -> Chart:
     room = 0.24 * (np.ptp(x) or 1.0)
     left = x[0] - 0.04 * room
     unit, along = (print_unit(str(values.attrs.get("units", "um"))) for values in (quoted["A"], position))
-    drawn = new_figure(
-        x=f"position / {along}",
-        y=f"deviation / {unit}",
-        height=360,
-        x_range=(left, x[-1] + room),
-        zero=True,
-    )
+    shown = (left, x[-1] + room)
+    drawn = new_figure(x=f"position / {along}", y=f"deviation / {unit}", height=360, x_range=shown, zero=True)
     columns: dict[str, np.ndarray] = {"target": quoted["target"].values, f"position / {along}": x}
     for direction in quoted["direction"].values:
         row = quoted.sel(direction=direction)
@@ -213,12 +206,8 @@ def plot_test(quoted: xr.Dataset, position: xr.DataArray) -> Chart:
         drawn.add_layout(whisker)
         looks = {"marker": MARKERS[direction], "size": 7, "color": COLOURS[direction]}
         points = drawn.scatter("x", "y", source=source, legend_label=name, **looks)
-        tips = [
-            ("position", f"@x{{0.###}} {along}"),
-            (f"mean {name}", f"@y{{0.00}} {unit}"),
-            ("s", f"@s{{0.00}} {unit}"),
-        ]
-        add_hover(drawn, tips, [points])
+        tips = [("position", f"@x{{0.###}} {along}"), (f"mean {name}", f"@y{{0.00}} {unit}")]
+        add_hover(drawn, [*tips, ("s", f"@s{{0.00}} {unit}")], [points])
         columns |= {f"mean, {name} / {unit}": mean, f"s, {name} / {unit}": s}
     if np.isfinite(quoted["mean_bidirectional"]).any():
         drawn.line(x, quoted["mean_bidirectional"].values, color=INK, line_dash="dotted", legend_label="mean of both")

@@ -11,10 +11,10 @@ import xarray as xr
 from bokeh.plotting import figure
 
 from fusion.common import own_name
-from fusion.report.charts.plan import add_marks, add_names, draw_picture
+from fusion.report.charts.plan import add_marks, add_names, draw_both, draw_picture
 from fusion.report.charts.style import DIVERGING, Chart, Courses, add_series, new_figure, of_rank, span_words
 from fusion.results.numbers import fixed
-from interferometry.plots import ACCENT, INK
+from interferometry.plots import ACCENT
 from thermography.evaluation import count_temperatures, read_profile
 from thermography.io.region import Region
 
@@ -111,8 +111,7 @@ def _draw_outline(drawn: figure, outline: dict[str, Any]) -> None:
     if outline["kind"] in ("box", "polygon"):
         points = np.vstack([points, points[:1]])
     if len(points) > 1:
-        for colour, width in ((INK, 4), ("#ffffff", 1.6)):
-            drawn.line(points[:, 0], points[:, 1], line_color=colour, line_width=width)
+        draw_both(drawn, *points.T)
     inside = right < 0.85 * drawn.x_range.end
     offset, align = (6, "left") if inside else (-6, "right")
     add_names(drawn, [right], [top], [outline["name"]], x_offset=offset, y_offset=-4, text_align=align)
@@ -139,15 +138,8 @@ def plot_regions(thermograms: xr.Dataset) -> Chart:
         if beyond.any():
             # The limit of the range is no temperature that was measured: what was there lies above it.
             times, limits = (each[beyond.values] for each in (seconds / scale, values.values))
-            add_series(
-                drawn,
-                times,
-                limits,
-                name="above the calibrated range",
-                colour=looks["colour"],
-                line=False,
-                marker="triangle",
-            )
+            looks = {"colour": looks["colour"], "line": False, "marker": "triangle"}
+            add_series(drawn, times, limits, name="above the calibrated range", **looks)
         columns[own_name(f"{name} / °C", columns)] = values.values
         told.append(f"{name} {span_words(values, '°C')}{' and above' if beyond.any() else ''}")
     return Chart(drawn, f"Temperatures in {seconds.size} pictures: {'; '.join(told)}.", columns)
