@@ -54,9 +54,11 @@ _LOG_RATIO_LIMITS: dict[Order, tuple[float, float]] = {1: (-14.0, 4.0), 2: (-14.
 #: A search that comes as near as this to a limit, decades, ended there: twice the accuracy of the search.
 _AT_LIMIT = 0.06
 #: What a search takes for minus the log-likelihood where there is no model, per decade of drift.
-_NO_MODEL = 1e100
-#: Edge of the first simplex, decades.
-_FIRST_STEP = 1.5
+_NO_MODEL = 1e20
+#: How far a search goes before it looks again, its step for a gradient, and the least drift at which it starts, decades.
+_BOX, _STEP, _LEAST_START = 1.5, 1e-3, -3.0
+#: A search goes on to another box where the last one raised the log-likelihood by at least this much, through so many at most.
+_LEAST_RISE, _MOST_BOXES = 0.01, 12
 #: A reading whose deletion residual exceeds this many standard deviations is down-weighted (robust fit).
 _OUTLIER_LIMIT = 3.0
 #: Multiple of that limit beyond which no residual is distinguished from a larger one.
@@ -69,8 +71,9 @@ _ROUNDING = float(np.finfo(float).eps)
 _SHARED_VALUES = 2**21
 #: Columns that fewer than this share of the readings have are few enough for their own recursion.
 _FEW_READINGS = 0.1
-#: So many fixed effects of single sites take part in the search for the variances of the drift at most.
-_MOST_SITES = 160
+#: Sites of single fixed effects that take part in the search for the variances of the drift at most, and at least where fewer have
+#: enough readings for its variances to 7 %.
+_MOST_SITES, _LEAST_SITES, _ENOUGH_READINGS = 160, 40, 10_000
 #: The drift is taken as an integrated random walk only if that raises the restricted log-likelihood by this much: where both fit,
 #: the random walk is the safer nuisance, because it extrapolates less.
 _SMOOTH_MARGIN = 2.0
@@ -309,34 +312,40 @@ def _sweep(gram: Array) -> tuple[Array, float, int]:
 
 
 def _maximise(system: DriftSystem, response: Array, design: Design, start: Array | None) -> DriftFit:
-    """Restricted maximum likelihood of the variance ratios by a bounded simplex in their logarithm."""
+    """Restricted maximum likelihood of the variance ratios by quasi-Newton steps in their logarithm (L-BFGS-B)."""
     low, high = _LOG_RATIO_LIMITS[system.order]
     components = system.loadings.shape[1]
     problem = _Problem.of(response, design)
-    searched, few = _for_search(system, problem)
+    searched, few = _for_search(system, problem, _ENOUGH_READINGS)
     unit = _log_ratio_unit(system)
 
     def ratios(log_ratio: Array) -> Array:
         return np.asarray(10.0 ** (unit + np.clip(log_ratio, low, high)))
-
-    guess = np.zeros(components) if start is None else np.clip(np.log10(np.maximum(start, 1e-300)) - unit, low, high)
-    # Steps that would leave the limits go the other way: clipped, they would leave the simplex without volume.
-    step = np.where(guess + _FIRST_STEP > high, -_FIRST_STEP, _FIRST_STEP)
-    simplex = np.vstack([guess, guess + np.diag(step)])
 
     def cost(log_ratio: Array) -> float:
         found = -_log_likelihood(replace(searched, ratios=ratios(log_ratio)), few)
         # Less drift is nearer to a model.
         return found if np.isfinite(found) else _NO_MODEL * (1.0 + float((log_ratio - low).sum()))
 
-    optimum = scipy.optimize.minimize(
-        cost,
-        guess,
-        method="Nelder-Mead",
-        bounds=[(low, high)] * components,
-        options={"initial_simplex": simplex, "xatol": 0.03, "fatol": 1e-3, "maxfev": 120 * components},
-    )
-    return _solve(replace(system, ratios=ratios(optimum.x)), problem)
+    def with_gradient(log_ratio: Array) -> tuple[float, Array]:
+        here, step = cost(log_ratio), np.where(log_ratio + _STEP > high, -_STEP, _STEP)
+        return here, np.array([cost(log_ratio + one) - here for one in np.diag(step)]) / step
+
+    best, least = np.zeros(components), np.inf
+    if start is not None:
+        # Far below the noise the likelihood is level, and no gradient leads back.
+        best = np.clip(np.log10(np.maximum(start, 1e-300)) - unit, _LEAST_START, high)
+    # A first step as long as a gradient makes it would end where the likelihood is level: the search moves on box by box.
+    for _ in range(_MOST_BOXES):
+        box = np.maximum(best - _BOX, low), np.minimum(best + _BOX, high)
+        optimum = scipy.optimize.minimize(
+            with_gradient, best, jac=True, method="L-BFGS-B", bounds=[*zip(*box, strict=True)], options={"ftol": 1e-7, "gtol": 0.02}
+        )  # fmt: skip
+        best, before, least = optimum.x, least, optimum.fun
+        at_edge = (best <= box[0]) & (box[0] > low) | (best >= box[1]) & (box[1] < high)
+        if not at_edge.any() or before - least < _LEAST_RISE:
+            break
+    return _solve(replace(system, ratios=ratios(best)), problem)
 
 
 def _log_likelihood(system: DriftSystem, problem: _Problem) -> float:
@@ -354,20 +363,22 @@ def _log_ratio_unit(system: DriftSystem) -> Array:
     )
 
 
-def _for_search(system: DriftSystem, problem: _Problem) -> tuple[DriftSystem, _Problem]:
+def _for_search(system: DriftSystem, problem: _Problem, enough: int | None = None) -> tuple[DriftSystem, _Problem]:
     """Return the readings by which the variances of the drift are searched for: all, or those of some of very many sites."""
-    if problem.design.shape[1] <= _MOST_SITES:
+    if problem.design.shape[1] <= _LEAST_SITES:
         return system, problem
     by_column = sparse.csc_array(problem.design)
-    own = sparse.csr_array(by_column[:, np.diff(by_column.indptr) < problem.design.shape[0] / _MOST_SITES])
-    if own.shape[1] <= _MOST_SITES:
+    own = sparse.csr_array(by_column[:, np.diff(by_column.indptr) < problem.design.shape[0] / _LEAST_SITES])
+    each = system.seconds.size / max(own.shape[1], 1)
+    most = _MOST_SITES if enough is None else int(np.clip(enough / each, _LEAST_SITES, _MOST_SITES))
+    if own.shape[1] <= most:
         return system, problem
     own.sort_indices()
     site = np.full(own.shape[0], -1)
     has_one = np.diff(own.indptr) > 0
     site[has_one] = own.indices[own.indptr[:-1][has_one]]
     sites = np.unique(site)
-    chosen = sites[np.round(np.linspace(0, sites.size - 1, _MOST_SITES)).astype(int)]
+    chosen = sites[np.round(np.linspace(0, sites.size - 1, most)).astype(int)]
     rows = np.isin(site, chosen)
     design = problem.design[rows]
     design = design[:, abs(design).sum(axis=0) > 0]
@@ -520,19 +531,20 @@ def estimate(
     def system(chosen: Order, ratios: Array) -> DriftSystem:
         return drift_system(seconds, loadings, order=chosen, ratios=ratios, variance=variance, observed=observed)
 
-    neutral = np.ones(loadings.shape[1])
+    neutral, found = np.ones(loadings.shape[1]), None
     if order is None:
         walk = _maximise(system(1, neutral), response, with_trends, None)
         smooth = _maximise(system(2, neutral), response, with_trends, None)
-        # The simplex can lose a component on its way: where the smooth drift is likelier by the sizes that the walk has, it starts there.
+        # A search can lose a component on its way: where the smooth drift is likelier by the sizes that the walk has, it starts there.
         as_walk = 10.0 ** (np.log10(walk.system.ratios) - _log_ratio_unit(walk.system) + _log_ratio_unit(smooth.system))
         if _log_likelihood(system(2, as_walk), _Problem.of(response, with_trends)) > smooth.log_likelihood:
             again = _maximise(system(2, neutral), response, with_trends, as_walk)
             smooth = max((smooth, again), key=lambda fit: fit.log_likelihood)
-        order = 2 if smooth.log_likelihood > walk.log_likelihood + _SMOOTH_MARGIN else 1
-        start = (walk if order == 1 else smooth).system.ratios
+        order, start = 1, walk.system.ratios
+        if smooth.log_likelihood > walk.log_likelihood + _SMOOTH_MARGIN:
+            order, found = 2, smooth
     columns = design if order == 1 else with_trends
-    fit = _maximise(system(order, neutral), response, columns, start)
+    fit = found or _maximise(system(order, neutral), response, columns, start)
     if robust:
         for _ in range(_ROBUST_ROUNDS):
             for _ in range(_ROBUST_PASSES):

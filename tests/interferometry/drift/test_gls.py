@@ -341,7 +341,8 @@ def test_a_drift_that_is_restless_at_the_start_alone_is_described_so(rng):
 def test_an_even_choice_of_very_many_sites_knows_the_variances_of_the_drift(rng, monkeypatch):
     seconds, loadings, y, design = simulated_test(rng)[:4]
     every = estimate(seconds, loadings, y, design, order=1, settling=True)
-    monkeypatch.setattr("interferometry.drift.gls._MOST_SITES", 12)
+    for name in ("_MOST_SITES", "_LEAST_SITES", "_ENOUGH_READINGS"):
+        monkeypatch.setattr(f"interferometry.drift.gls.{name}", 12)
     some = estimate(seconds, loadings, y, design, order=1, settling=True)
     # 12 of the 16 sites: the variances differ by their own uncertainty, the profile by a small share of its own.
     assert not np.array_equal(some.system.ratios, every.system.ratios)
