@@ -20,6 +20,7 @@ from fusion.campaign.config import HeaderRows, LoggedTable
 from fusion.campaign.logs import (
     MONITORED,
     Rows,
+    has_unit,
     numbers_in,
     read_rows,
     read_times,
@@ -57,7 +58,9 @@ _VOCABULARY = vocabulary("columns")
 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
-_NO_NUMBERS, _NOT_KNOWN, _UNIT_NOT_KNOWN = "no numbers", "not known", "unit not known"
+_NO_NUMBERS, _NOT_KNOWN = "no numbers", "not known"
+#: Of a column whose unit is to be stated.
+UNIT_NOT_KNOWN = "unit not known"
 #: What only the values of a column tell: that it is a temperature, and its unit.
 _BY_VALUES, _UNIT_BY_VALUES = "by its values", "unit by its values"
 _COUNTS = "whole numbers: counts? then one count with its unit, as 0.0125 mm"
@@ -75,6 +78,11 @@ _TIME = re.compile(r"(time|t$|ts$|elapsed|seconds$|sec$|minutes$|min$|hours$|dat
 _VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
 #: Marks of loggers and drivers of sensors for "no reading" that look like numbers.
 _MARKS = tuple(_VOCABULARY["marks"])
+#: Words in brackets that may be a unit, beside which a temperature has no usual one; a factor beside a unit.
+_NO_UNITS = frozenset(_VOCABULARY["no_units"])
+_FACTOR = re.compile(r"[x×*·/]?\s*\d[\d.,eE^/+-]*\s*[x×*·]?|[x×*·]")
+#: What a DS18B20 gives before its first conversion, degC and degF (Maxim, data sheet 19-7487), this far from its neighbours, K.
+_POWER_ON, _POWER_ON_JUMP = (85.0, 185.0), 5.0
 #: A mark lies this far outside the other values of its column.
 _FAR = 50.0
 #: Times that neither ISO 8601 nor the guess of pandas covers.
@@ -262,7 +270,7 @@ def propose_table(path: Path) -> TableProposal:
         times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
         columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
         not_known = "time_unit" in asked and any(_stated_units(rows, name) for name in times)
-        remark = _UNIT_NOT_KNOWN if not_known else ""
+        remark = UNIT_NOT_KNOWN if not_known else ""
         timed = (Column(name, "time", keys.get("time_unit", ""), _first(frame[name]), remark=remark) for name in times)
         columns = [*timed, *columns]
     steps = [match[1] for _, text, _ in head if (match := _STEP.match(text))]
@@ -271,12 +279,17 @@ def propose_table(path: Path) -> TableProposal:
             replace(one, unit=f"{steps[0]} mm", remark="counts, of step_dist") if one.remark == _COUNTS else one
             for one in columns
         ]
+    if marks:
+        rows = read_rows(path, sheet=sheet, header=header, missing=marks)
     time, reference, lines = _read(path, rows, keys)
+    lost = {line.line for line in lines["left_out"]}
+    used = [name for one in columns if one.role in ROLES[1:-1] for name in rows.marks.get(one.heading, ())]
+    lines["marks"] = [mark for mark in used if mark.line not in lost]
     return TableProposal(
         path,
         keys | ({"missing": marks} if marks else {}),
         tuple(columns),
-        len(frame) + len(rows.left_out) - len(lines.get("left_out", ())),
+        len(frame) + len(rows.left_out) - len(lines["left_out"]),
         asked,
         time,
         reference,
@@ -295,7 +308,11 @@ def _read(path: Path, rows: Rows, keys: Mapping[str, Any]) -> tuple[np.ndarray, 
     time, reference, without = read_times(path, rows, layout, [headings] if isinstance(headings, str) else headings)
     keep = ~np.isnat(time)
     back = [] if "long" in keys else where_clock_goes_back(path, rows.frame.index[keep], time[keep])
-    return time[keep], reference, {"left_out": [*rows.left_out, *without], "clock": back}
+    return (
+        time[keep],
+        reference,
+        {"left_out": sorted([*rows.left_out, *without], key=lambda line: line.line), "clock": back},
+    )
 
 
 def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple[list[Column], list[float]]:
@@ -306,6 +323,11 @@ def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple
         _column(heading, units.get(heading, ""), series, numbers[heading][~np.isin(numbers[heading], found[heading])])
         for heading, series in groups.items()
     ]
+    for k, (heading, series) in enumerate(groups.items()):
+        if columns[k].role == "temperature" and (mark := _power_on(numbers[heading])):
+            found[heading].append(mark)
+            rest = numbers[heading][~np.isin(numbers[heading], found[heading])]
+            columns[k] = _column(heading, units.get(heading, ""), series, rest)
     used = [column.heading for column in columns if column.role != "out"]
     marks = {mark for heading in used for mark in found[heading]}
     return columns, sorted(
@@ -418,7 +440,7 @@ def _numbers_channels(rows: Sequence[tuple[int, list[str]]]) -> bool:
 def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
     """Whether the first row and enough others as wide hold little but numbers and times, with a number in each."""
     texts = [[text.strip() for text in fields if text.strip()] for _, fields in rows]
-    numeric = [sum(_VALUE.fullmatch(text) is not None for text in row) for row in texts]
+    numeric = [sum(_VALUE.fullmatch(text) is not None or has_unit(text) for text in row) for row in texts]
     values = [
         count >= max(1, len(row) / 2) and len(fields) == len(rows[0][1])
         for count, row, (_, fields) in zip(numeric, texts, rows, strict=True)
@@ -475,7 +497,7 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
             if not {*stated} & {*TIME_UNITS}:
                 _place_times(_finite(frame[name]), keys, asked)
                 if stated and "time_unit" in asked:
-                    asked["time_unit"] += f", in {stated[0]}: {_UNIT_NOT_KNOWN}"
+                    asked["time_unit"] += f", in {stated[0]}: {UNIT_NOT_KNOWN}"
             return (name,)
         for columns in ([name, *[two for two in days if two != name][:1]], [name]):
             form = _clock(_sample(written_times(frame, columns)))
@@ -494,7 +516,9 @@ def _stated_units(rows: Rows, name: str) -> list[str]:
 
 def _is_time_name(heading: str, unit: str) -> bool:
     """Whether a heading, or its unit in a row of units, is that of a time or a date."""
-    return is_time(heading) or unit_name(unit) in TIME_UNITS or _TIME.match(heading.strip()) is not None
+    name, in_heading = name_and_unit(heading)
+    named = _TIME.match(name) is not None and role_of_unit(unit or in_heading) != "temperature"
+    return is_time(heading) or unit_name(unit) in TIME_UNITS or named
 
 
 def _sample(column: pd.Series) -> list[str]:
@@ -591,7 +615,8 @@ def _formatted(text: str, form: str) -> datetime | None:
 def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> Column:
     """Propose role and unit of a column from its unit, the words of its heading, and its values."""
     name, in_heading = name_and_unit(heading)
-    if "[" not in heading and not is_unit(in_heading) and (in_heading.isdecimal() or in_heading.isalpha()):
+    of_place = "[" not in heading and not is_unit(in_heading) and (in_heading.isdecimal() or in_heading.isalpha())
+    if of_place and in_heading.casefold() not in _NO_UNITS and _word(name)[1] != "displacement":
         in_heading = ""  # TC(1), T (air): a number or a word, no unit
     # What the last word of a name means depends on the others: in is an inlet beside a temperature.
     suffixes = _SUFFIXES | _SUFFIXES_OF.get(_word(name)[1], {})
@@ -614,9 +639,14 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         return replace(known, role="driver", unit=unit or "1", remark="set point")
     if unit:
         of_unit = role_of_unit(unit)
-        if role in ("temperature", "displacement") and of_unit == "driver" and not is_unit(unit):
-            # What moves is no driver of itself; a temperature in an unknown unit is refused.
-            return replace(known, role=role if role == "temperature" else "out", remark=_UNIT_NOT_KNOWN)
+        if of_unit == "driver" and not is_unit(unit) and role != "driver":
+            # A factor whose sense is not known stands beside the unit.
+            of_rest = role_of_unit(_FACTOR.sub("", unit).strip())
+            return replace(
+                known, role=role or ("out" if of_rest == "driver" else of_rest), unit=unit, remark=UNIT_NOT_KNOWN
+            )
+        if role == "temperature" and of_unit == "displacement" and (len(word) > 2 or unit in ("m", "in")):
+            return replace(known, role=role, remark=UNIT_NOT_KNOWN)
         taken = role == "out" or (role == "driver" and of_unit == "displacement")
         return replace(known, role=role if taken and of_unit != "temperature" else of_unit)
     if role == "out":
@@ -677,11 +707,26 @@ def _is_unit_of(role: str, unit: str) -> bool:
 
 def _is_mark(mark: float, numbers: np.ndarray) -> bool:
     """Whether a number is a mark for no reading: far outside all others, or the only one of its column."""
-    others = numbers[numbers != mark]
-    if others.size in (0, numbers.size):
-        return others.size < numbers.size
+    others = numbers[~np.isin(numbers, _MARKS)]
+    if others.size == 0 or mark not in numbers:
+        return mark in numbers
     far = _FAR + float(np.ptp(others))
     return mark < float(others.min()) - far or mark > float(others.max()) + far
+
+
+def _power_on(numbers: np.ndarray) -> float:
+    """Return the number of a DS18B20 without a conversion where each stands far from the readings before and after it; 0 without one."""
+    for mark in _POWER_ON:
+        readings = numbers[~np.isin(numbers, _MARKS)]
+        at = np.flatnonzero(readings == mark)
+        others = readings[readings != mark]
+        if at.size and others.size > 1:
+            following = at - np.arange(at.size)
+            beside = [others[np.clip(following + step, 0, others.size - 1)] for step in (-1, 0)]
+            least = _POWER_ON_JUMP + 20.0 * float(np.median(np.abs(np.diff(others))))
+            if np.min(np.abs(np.array(beside) - mark)) > least:
+                return mark
+    return 0.0
 
 
 def _first(series: pd.Series) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from fusion.campaign.columns import ROLES, ColumnsError, TableProposal, propose_runs
+from fusion.campaign.columns import ROLES, UNIT_NOT_KNOWN, ColumnsError, TableProposal, propose_runs
 from fusion.campaign.inspect import FolderContent, Kind, Recognised, scan_folder
 from fusion.campaign.schema import Key, keys_of, known_keys
 from fusion.campaign.values import column_conversion, role_of_unit
@@ -492,9 +492,11 @@ def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker)
     yield from _others("file", content, [one for one in records if one not in runs], all_of_them=True)
     yield from ("", "[record.columns]                         # a column without a line here is left out")
     for column in table.columns:
-        remark = f"   # {_plain(', '.join(filter(None, (column.span, column.remark))))}".rstrip("# ")
+        stated = column.unit if column.remark == UNIT_NOT_KNOWN else ""
+        remark = f"   # {_plain(', '.join(filter(None, (column.span, stated, column.remark))))}".rstrip("# ")
         if column.role in ROLES[1:-1]:
-            yield f"{_quoted(column.heading)} = {_toml({'role': column.role, 'unit': column.unit})}{remark}"
+            unit = TO_FILL if stated and asker.ask is None else column.unit
+            yield f"{_quoted(column.heading)} = {_toml({'role': column.role, 'unit': unit})}{remark}"
         elif column.role == "out":
             unit = column.unit or "1"
             example = _toml({"role": role_of_unit(unit), "unit": unit})
@@ -533,12 +535,19 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
             keys[key] = asker.choice(f"Unit of the times in {table.of('time')[0].heading}, {shown}", units)
         else:
             keys[key] = asker.value(known_keys()["record.every"], "60 s" if asker.ask else "") or TO_FILL
-    guessed = [column for column in table.of("displacement") if column.remark]
-    for unit in dict.fromkeys(column.unit for column in guessed):
-        group = [column for column in guessed if column.unit == unit]
+    guessed = [column for column in table.of("displacement") if column.remark and column.remark != UNIT_NOT_KNOWN]
+    not_known = [column for column in table.columns if column.remark == UNIT_NOT_KNOWN and column.role in ROLES[1:3]]
+    for role, unit in dict.fromkeys(
+        (column.role, column.unit) for column in guessed + (not_known if asker.ask else [])
+    ):
+        group = [column for column in (*guessed, *not_known) if (column.role, column.unit) == (role, unit)]
         about = ", ".join(f"{column.heading} ({column.span})" for column in group)
-        answer = asker.unit(f"Unit of {about}; of counts one count, such as 0.0125 mm", "um", unit)
-        taken = {column: replace(column, unit=answer) for column in group}
+        target, one = ("um", "0.0125 mm") if role == "displacement" else ("degC", "0.1 degC")
+        answer = asker.unit(f"Unit of {about}; of counts one count, such as {one}", target, unit)
+        taken = {
+            column: replace(column, unit=answer, remark="" if column in not_known else column.remark)
+            for column in group
+        }
         table = replace(table, columns=tuple(taken.get(column, column) for column in table.columns))
     assumed = ["time_unit"] if "time_unit" in table.asked and keys["time_unit"] != TO_FILL else []
     assumed += [

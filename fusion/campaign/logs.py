@@ -5,11 +5,12 @@ from __future__ import annotations
 import fnmatch
 import io
 import json
+import math
 import re
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import accumulate, chain, count
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,14 @@ from fusion.campaign.values import (
     unit_name,
 )
 from fusion.common import Array, FusionError
-from interferometry.io.faults import THOUSANDS, LaserFormatError, Numerals, RejectedLine, raise_if_mostly_invalid
+from interferometry.io.faults import (
+    SENTINEL_MAGNITUDE,
+    THOUSANDS,
+    LaserFormatError,
+    Numerals,
+    RejectedLine,
+    raise_if_mostly_invalid,
+)
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
     DELIMITERS,
@@ -57,6 +65,7 @@ from interferometry.io.tables import (
     where_clock_goes_back,
 )
 from thermofuse.resources import vocabulary
+from thermofuse.units import find_unit
 
 #: Warning of pandas about a line with more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
@@ -96,6 +105,10 @@ MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d\s\d\d:\d\d:\d\d(\.\d+)?\s+\S")
 _LIQUID_AIR_K = 79.0
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
+#: A number and the unit beside it in one cell.
+_BESIDE = re.compile(r"([-+−]?[\d.,]*\d(?:[eE][-+]?\d+)?)\s*([^\s\d].*)")
+#: What a line that sums up those above it is called.
+_SUMMARY = re.compile(rf"(?<![^\W\d_])({'|'.join(vocabulary('columns')['summaries'])})(?![^\W\d_])", re.IGNORECASE)
 #: Where seconds count from in a table whose start is not stated.
 NO_START = np.datetime64("1970-01-01", "ns")
 
@@ -217,11 +230,14 @@ def _laid_out(path: Path, layout: LoggedTable) -> DelimitedTable:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """A logged table as text and numbers, by lines of its file; its row of units by heading, and lines that do not fit."""
+    """A logged table as text and numbers, by lines of its file; its units by heading, lines that do not fit or sum the others up, and by
+    heading cells that are no readings.
+    """
 
     frame: pd.DataFrame
     units: Mapping[str, str]
     left_out: list[RejectedLine]
+    marks: Mapping[str, list[RejectedLine]] = field(default_factory=dict)
 
 
 def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
@@ -240,6 +256,7 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
             _find(path, heading, frame)
     time, reference, left_out = read_times(path, rows, record, record.time or (record.long.time if record.long else ()))
     left_out = [*rows.left_out, *(line for line in left_out if not lost.get(line.line, False))]
+    left_out.sort(key=lambda line: line.line)
     headings, held = [str(name) for name in frame.columns if name not in (record.time or ())], list[dict[str, Any]]()
     if record.long is not None:
         of_lines = stripped(frame[record.long.channel])
@@ -295,6 +312,14 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
     sensors, _, temperature = block("temperature", "degC")
     channels, _, displacement = block("displacement", "um")
     drivers, driver_units, driver = block("driver", None)
+    lost_lines = {line.line for line in left_out}
+    marks = [
+        mark
+        for of_role in columns.values()
+        for heading in of_role
+        for mark in rows.marks.get(heading, ())
+        if mark.line not in lost_lines
+    ]
     celsius = {"units": "degC", "units_metadata": "temperature: on_scale"}
     table = xr.Dataset(
         {
@@ -308,6 +333,7 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
             "source": path.name,
             "left_out": json.dumps([asdict(line) for line in left_out]),
             "clock": json.dumps([asdict(line) for line in goes_back]),
+            "marks": json.dumps([asdict(line) for line in marks]),
             "held": json.dumps(held),
             "rises": json.dumps(rises),
         },
@@ -360,15 +386,16 @@ def read_rows(
     """Read a whole table, text or a sheet of a spreadsheet; without `header` its first line that is no comment holds the names."""
     with path.open("rb") as file:
         workbook = is_workbook(file.read(8))
-    if workbook:
-        return _read_sheet(path, sheet, header, list(missing))
     try:
-        return _read_text(path, header, list(missing))
+        rows = None if workbook else _read_text(path, header)
     except (ValueError, OSError, pd.errors.ParserError) as error:
         raise TableError(f"{path}: cannot be read as a table: {error}; save it as CSV in UTF-8 or as XLSX") from None
+    return _without_marks(
+        path, rows or _read_sheet(path, sheet, header), [mark for mark in missing if not isinstance(mark, str)]
+    )
 
 
-def _read_sheet(path: Path, sheet: str | None, header: HeaderRows | None, missing: list[float | str]) -> Rows:
+def _read_sheet(path: Path, sheet: str | None, header: HeaderRows | None) -> Rows:
     """Read one sheet of a spreadsheet, the first without a name, with the types that pandas gives the columns."""
     sheets = read_cells(path, as_stored=True)
     name = sheet or next(iter(sheets))
@@ -379,7 +406,7 @@ def _read_sheet(path: Path, sheet: str | None, header: HeaderRows | None, missin
     by_line = {line: [cell_text(cell) for cell in cells] for line, cells in sheets[name] if line < header.values}
     below = [(line, cells) for line, cells in sheets[name] if line >= header.values]
     names = by_line.get(header.names or 0) or [str(k + 1) for k in range(len(sheets[name][0][1]))]
-    frame = TextParser([names, *(cells for _, cells in below)], na_values=missing).read()
+    frame = TextParser([names, *(cells for _, cells in below)]).read()
     # Lines are counted in the file.
     frame.index = pd.Index([line for line, _ in below])
     return _named(frame, by_line.get(header.units or 0, []), [])
@@ -473,7 +500,7 @@ def _tabulated(path: Path, lines: list[str], sample: list[str], header: HeaderRo
     return tabulated
 
 
-def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]) -> Rows:
+def _read_text(path: Path, header: HeaderRows | None) -> Rows:
     """Read delimited text with the dialect that its header line, or without one its first line of values, shows."""
     lines = text_lines(path, header)
     if header is None:
@@ -491,14 +518,13 @@ def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]
     decimal = Numerals.of(text for line in below[:_SAMPLE] for text in fields_of(line, delimiter)).decimal
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pd.errors.ParserWarning)
-        frame = pd.read_csv(  # type: ignore[call-overload] # numbers may be marks too
+        frame = pd.read_csv(
             io.StringIO("".join([names.strip("\n"), "\n", *below])),
             sep=delimiter or r"\s+",
             decimal=decimal or ".",
             skipinitialspace=True,
             index_col=False,
             on_bad_lines="warn",
-            na_values=missing,
             low_memory=False,  # in parts, a column could be numbers above and text below
         )
     if any("loss of data" in str(warning.message) for warning in caught):
@@ -550,6 +576,73 @@ def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) 
         names[next(one for one in chain([plain], (f"{plain}.{n}" for n in count(1))) if one not in names)] = None
     frame.columns = list(names)
     return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
+
+
+def _without_marks(path: Path, rows: Rows, missing: Sequence[float]) -> Rows:
+    """Return rows without lines that sum the others up and marks for no reading, both named, and numbers without the unit beside them in
+    their cells; refuse another header whose columns or units differ.
+    """
+    frame, units = rows.frame, dict(rows.units)
+    summaries, marks = dict[int, str](), dict[str, list[RejectedLine]]()
+    of_units, anew = Counter[int](), dict[int, tuple[str, str, str]]()
+    for name in map(str, frame.columns):
+        texts = stripped(frame[name]) if not pd.api.types.is_numeric_dtype(frame[name]) else None
+        if texts is not None:
+            filled = texts[texts != ""]
+            sample = filled.iloc[:_SAMPLE]
+            if 2 * sum(map(has_unit, sample)) > len(sample):
+                frame[name], units[name] = _unit_in_cells(path, name, texts)
+            elif 2 * np.isfinite(numbers_in(sample)).sum() <= len(sample):
+                continue
+        numbers = numbers_in(frame[name])
+        known = units.get(name, "").strip("- ") or name_and_unit(name)[1]
+        odd = np.isin(numbers, missing) | (np.abs(numbers) >= SENTINEL_MAGNITUDE)
+        if texts is not None:
+            odd |= np.isnan(numbers) & (texts != "").to_numpy()
+        for line, cell in frame[name][odd].items():
+            text = str(cell).strip()
+            unit = name_and_unit(text)[1]
+            heads = (is_unit(unit) and unit != unit_name(known)) or (text != name and text in frame.columns)
+            # A unit alone may be a state; a row of them heads what is below it.
+            of_units[line] += 2 if heads else is_unit(text) and text not in ("-", "1")
+            if heads or (known and is_unit(text) and unit_name(text) != unit_name(known)):
+                anew[line] = text, name, known
+            if _SUMMARY.search(text):
+                summaries[line] = text
+            else:
+                marks.setdefault(name, []).append(RejectedLine(path.name, line, text, f"is no reading of {name}"))
+        if odd.any():
+            frame[name] = frame[name].mask(odd & np.isfinite(numbers))
+    line, (text, name, known) = next(((line, of) for line, of in anew.items() if of_units[line] > 1), (0, ("", "", "")))
+    if line:
+        raise TableError(
+            f'{path}, line {line}: {text!r} heads the column "{name}"{f", in {known} so far," if known else ""} anew; give what was logged '
+            "before and after this line in files of its own"
+        )
+    left_out = [RejectedLine(path.name, line, text, "sums up other lines") for line, text in sorted(summaries.items())]
+    return Rows(frame.drop(index=list(summaries)), units, [*rows.left_out, *left_out], marks)
+
+
+def has_unit(text: str) -> bool:
+    """Whether a cell holds a number with its unit."""
+    return (match := _BESIDE.fullmatch(text)) is not None and is_unit(match[2])
+
+
+def _unit_in_cells(path: Path, name: str, texts: pd.Series) -> tuple[pd.Series, str]:
+    """Return the numbers of cells such as "23.5 °C", in the unit that most of them have, and that unit."""
+    parts = [_BESIDE.fullmatch(text) for text in texts]
+    written = [unit_name(part[2]) if part else "" for part in parts]
+    most = Counter(filter(None, written)).most_common(1)[0][0]
+    numerals, whole = Numerals.of(part[1] for part in parts if part), find_unit(most)
+    values = []
+    for line, part, unit in zip(texts.index, parts, written, strict=True):
+        value, one = numerals.number(part[1]) if part else math.nan, find_unit(unit)
+        if unit != most and part and (one is None or whole is None or one.kind != whole.kind):
+            raise TableError(f'{path}, line {line}: the column "{name}" is in {most}, here in {unit}; write one unit')
+        if unit != most and one and whole:
+            value = (value * one.factor + one.offset - whole.offset) / whole.factor
+        values.append(value)
+    return pd.Series(values, texts.index), most
 
 
 def numbers_in(column: pd.Series) -> np.ndarray:
@@ -687,10 +780,19 @@ def read_times(
         words = describe_time_zone(path, zones) if zones else ""
     if words == NO_ZONE and (zone := _zone_of(" ".join(headings))):
         time, words = time - _offset(zone), f"{describe_time_zone(path, {zone: 0})}, as the heading says"
+    same = np.flatnonzero(np.diff(time) == np.timedelta64(0)) + 1
+    if same.tolist() == [len(time) - 1]:
+        # What alone repeats a time, at the end, sums up the rows above it.
+        time[-1] = np.datetime64("NaT")
     timed = ~np.isnat(time)
     cells = frame[list(headings)]
     left_out = [
-        RejectedLine(path.name, int(frame.index[at]), " ".join(map(str, cells.iloc[at].dropna())), "is not a time")
+        RejectedLine(
+            path.name,
+            int(frame.index[at]),
+            " ".join(map(str, cells.iloc[at].dropna())),
+            "repeats the time of the line above" if at == len(time) - 1 and at in same else "is not a time",
+        )
         for at in np.flatnonzero(~timed)
     ]
     raise_if_mostly_invalid(

@@ -42,16 +42,17 @@ class Read(Protocol):
 
 
 def left_out_notices(dataset: Read, code: str) -> list[Notice]:
-    """Return one notice for each file that counts its rejected lines and lists the first of them."""
+    """Return notices for each file that count its rejected lines and its cells without a reading, and list the first of them."""
     from fusion.results.results import Notice  # loads numpy: progress is shown before
 
     return [
         Notice(
             code,
-            f"{counted(len(named), 'line')} of {path} left out: {listed(named)}.",
-            f"Correct these lines in {path} and run again; the estimates allow for the gaps.",
+            f"{counted(len(named), noun)} of {path} left out: {listed(named)}.",
+            f"Correct these {noun}s in {path} and run again; the estimates allow for the gaps.",
         )
-        for path, named in _lines_by_file(dataset, "left_out")
+        for name, noun in (("left_out", "line"), ("marks", "reading"))
+        for path, named in _lines_by_file(dataset, name)
     ]
 
 

@@ -507,12 +507,77 @@ def test_temperatures_in_other_units_are_converted(tmp_path: Path, unit: str, fa
     np.testing.assert_allclose(read_record(load_campaign(path))["temperature"].values[:, 0], 20 + np.arange(100) / 100)
 
 
-def test_a_temperature_in_an_unknown_unit_is_refused_and_no_driver(tmp_path: Path) -> None:
+def record_of(folder: Path, text: str) -> xr.Dataset:
+    """The record that is drafted from a table."""
+    folder.mkdir()
+    (folder / "log.csv").write_text(text)
+    path, asked = write_campaign(folder, Asker(None))
+    assert not asked
+    return read_record(load_campaign(path))
+
+
+@pytest.mark.parametrize(
+    ("head", "asked"),
+    [
+        ("time [s],temp bed [centi],T2 [degC],Z [um]", ["temp bed [centi]"]),
+        ("time [s],temp x10,T2 [degC],Z x1000 (mm)", ["temp x10", "Z x1000 (mm)"]),
+        ("time [s],T1*10,T2/10 [degC],Z (tenths)", ["T1*10", "T2/10 [degC]", "Z (tenths)"]),
+        ("time [s],bed (x10 °C),T2 [degC],Z *10^-3 [mm]", ["bed (x10 °C)", "Z *10^-3 [mm]"]),
+        ("t [m],T1 [degC],T2 [degC],Z [um]", ["time_unit"]),
+        ("time [s],T1 [degC],temperature 2 [mm],Z [um]", ["temperature 2 [mm]"]),
+    ],
+)
+def test_a_unit_or_factor_that_is_not_understood_is_asked(tmp_path: Path, head: str, asked: list[str]) -> None:
     lines = [f"{60 * k},{20 + k / 100},{21 + k / 90},{k}.5" for k in range(100)]
-    (tmp_path / "log.csv").write_text("\n".join(["time [s],temp bed [centi],T2 [degC],Z [um]", *lines]) + "\n")
-    path, _ = write_campaign(tmp_path, Asker(None))
-    with pytest.raises(CampaignError, match='"centi" is not a unit of a temperature'):
-        read_record(load_campaign(path))
+    (tmp_path / "log.csv").write_text("\n".join([head, *lines]) + "\n")
+    _, missing = write_campaign(tmp_path, Asker(None))
+    assert len(missing) == len(asked) and all(name in line for name, line in zip(asked, missing, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("head", "line"),
+    [
+        ("time [s],T1 (0.1 °C),T2 (m°C),Z (1/10 µm)", "{s},{dT1},{mT2},{dZ}"),
+        ('Time (mn),"Temp, °F (LGR S/N: 12, SEN S/N: 7)",T2 [oC],"Z, mm"', "{min},{F1},{T2},{mm}"),
+        ("Time,T1,T2,Z", "{min} min,{F1} °F,{T2} °C,{Z} um"),
+        ("Time,T1,T2,Z\nmin,°F,°C,µin", "{min},{F1},{T2},{uin}"),
+    ],
+)
+def test_units_that_are_stated_are_read_wherever_they_stand(tmp_path: Path, head: str, line: str) -> None:
+    warm = 1 - np.exp(-np.arange(120) / 30)
+    t1, t2, z = 20 + 5 * warm, 21 + 2 * warm, 40 * warm
+    lines = [
+        line.format(s=60 * k, min=k, dT1=10 * a, F1=1.8 * a + 32, T2=b, mT2=1e3 * b, Z=c, dZ=10 * c, mm=c / 1e3, uin=c / 0.0254)
+        for k, (a, b, c) in enumerate(zip(t1, t2, z, strict=True))
+    ]  # fmt: skip
+    data = record_of(tmp_path / "folder", "\n".join([head, *lines]) + "\n")
+    np.testing.assert_allclose(data["temperature"].values, np.stack([t1, t2], axis=1), atol=1e-9)
+    np.testing.assert_allclose(data["displacement"].values[:, 0], z, atol=1e-9)
+    np.testing.assert_array_equal(np.diff(data["time"].values), np.timedelta64(60, "s"))
+
+
+@pytest.mark.parametrize(
+    "anew", ["time [s],T1 [degF],Z [mm]", "s,degF,mm", "time [s],Z [um],T1 [degC]", "min,T2 (°C),Z (mm)"]
+)
+def test_a_header_that_changes_the_columns_is_refused_by_its_line(tmp_path: Path, anew: str) -> None:
+    lines = [f"{60 * k},{20 + k / 100},{k}.5" for k in range(100)]
+    (tmp_path / "log.csv").write_text("\n".join(["time [s],T1 [degC],Z [um]", *lines[:50], anew, *lines[50:]]) + "\n")
+    with pytest.raises(TableError, match=r"log.csv, line 52: .* anew"):
+        propose_table(tmp_path / "log.csv")
+
+
+def test_lines_that_sum_up_the_others_and_marks_are_left_out_and_named(tmp_path: Path) -> None:
+    """85 degC of a DS18B20 at power-on and -127 when it is lost, OL of a meter, a mean as last line, and its time again."""
+    lines = [f"{60 * k},{20 + k / 100:.2f},{21 + k / 90:.3f},{k}.5" for k in range(100)]
+    lines[0], lines[40] = "0,85.00,21,0.5", "2400,-127.00,OL,40.5"
+    lines += ["6000,20.5,21.5,50 avg", "Mean,20.5,21.5,50", "5940,20.5,21.6,99.5"]
+    data = record_of(tmp_path / "folder", "\n".join(["time [s],T1 [degC],T2 [degC],Z [um]", *lines]) + "\n")
+    assert data.sizes["time"] == 100 and np.flatnonzero(np.isnan(data["temperature"].values[:, 0])).tolist() == [0, 40]
+    left_out, marks = (
+        [(one["line"], one["value"]) for one in json.loads(data.attrs[name])] for name in ("left_out", "marks")
+    )
+    assert left_out == [(102, "50 avg"), (103, "Mean"), (104, "5940")]
+    assert sorted(marks) == [(2, "85.0"), (42, "-127.0"), (42, "OL")]
 
 
 @pytest.mark.parametrize("kind", ["workbook", "text"])
@@ -557,7 +622,7 @@ ALIGNED = {
         ("Time,101,102,103,104", ["102", "104"], [], ("101", "102", "103", "104")),
         ("Time,X,T bed,Y,T (air)", ["T bed", "T (air)"], ["X", "Y"], ("X", "T bed", "Y", "T (air)")),
         # Balances in kg have the numbers of temperatures.
-        ("Time,X [um],Net(1),Y [furlong],T1 [degC]", ["T1 [degC]"], ["X [um]"], ()),
+        ("Time,X [um],Net(1),Y [furlong],T1 [degC]", ["T1 [degC]"], ["X [um]", "Y [furlong]"], ()),
     ],
 )
 def test_what_only_values_tell_is_marked_and_a_name_that_says_something_else_is_no_temperature(
@@ -570,7 +635,7 @@ def test_what_only_values_tell_is_marked_and_a_name_that_says_something_else_is_
     assert {*temperatures} <= {one.heading for one in table.of("temperature")}
     assert [one.heading for one in table.of("displacement")] == displacements
     assert tuple(one.heading for one in table.columns if one.role != "out" and one.is_guessed) == guessed
-    if displacements:
+    if displacements and "furlong" not in head:
         record = load_campaign(write_campaign(tmp_path, Asker(None))[0]).record
         assert record is not None and record.guessed == guessed
 

@@ -139,7 +139,7 @@ def test_a_number_sign_in_a_heading_is_part_of_it_and_lines_are_counted_in_the_f
     data = read_record(load_campaign(campaign))
     assert data["sensor"].values.tolist() == ["t #1"]
     assert data.sizes["time"] == 5
-    misfit, no_time = json.loads(data.attrs["left_out"])
+    no_time, misfit = json.loads(data.attrs["left_out"])
     assert misfit == {"path": "record.csv", "line": 9, "value": "5 fields", "reason": "4 were expected"}
     assert (no_time["line"], no_time["value"]) == (8, "?")
 
