@@ -873,7 +873,15 @@ def plan(
     power: Annotated[
         float, Option(min=0.1, max=0.99, help="Wanted probability of detecting the weakest source.")
     ] = 0.8,
+    largest: Annotated[
+        list[str], Option(metavar="NAME=LEVEL", help="RESULTS: highest level of a driver, if not that of the record.")
+    ] = [],  # noqa: B006
+    nc: Annotated[
+        Path | None, Option(help="RESULTS: write the schedule as an NC program of speeds and dwells.")
+    ] = None,
+    control: Annotated[str, Option(help="Control of --nc: linuxcnc, siemens840d or fanuc.")] = "linuxcnc",
     seed: Annotated[int, Option(help="Another seed is another, equally valid schedule.")] = 0,
+    as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Propose a random duty schedule for a new test.
 
@@ -881,13 +889,27 @@ def plan(
     with the uncertainty of a prediction that is expected after it. A mat or a fan
     at a single place is a source, too: it tests the place itself.
     """
-    from fusion.pipeline.plan import duty_lines, next_test_lines
+    from dataclasses import asdict
+
+    from fusion.pipeline import plan as planned
 
     with _answering():
         if results is not None:
-            _print_lines(next_test_lines(results, seed=seed))
+            tests = planned.next_tests(results, largest, seed=seed)
+            if nc is not None:
+                planned.write_nc_program(nc, planned.choose_test(tests), control=control)
+            if as_json:
+                print_json({"tried": [asdict(one) for one in tests], "proposed": asdict(planned.choose_test(tests))})
+            else:
+                _print_lines(planned.next_test_lines(tests))
             return
-        _print_lines(duty_lines(source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed))
+        duty = planned.propose_duty(
+            source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed
+        )
+        if as_json:
+            print_json(planned.describe_duty(duty))
+        else:
+            _print_lines(planned.duty_lines(duty, power=power))
 
 
 def main() -> None:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 from fusion.analysis.alignment.sensor_health import describe_fault
 from fusion.analysis.attribution.duty import DutyPlanError, Machine, plan_duty, switchings
-from fusion.analysis.drift_model.next_test import propose_tests
+from fusion.analysis.drift_model.next_test import NextTest, choose_test, propose_tests
 from fusion.analysis.drift_model.record import examine_record
 from fusion.analysis.drift_model.record_data import reduce_record
 from fusion.analysis.drift_model.verification import ChannelVerdict, verify
@@ -25,11 +26,16 @@ from fusion.results.store import file_sha256, read_product
 
 #: Inputs that are named as known worst.
 _NAMED = 4
+#: Share by which a test lowers an uncertainty where it is worth its time.
+_WORTH_IT = 0.1
+#: A dwell in seconds by control: LinuxCNC and SINUMERIK in seconds, Fanuc in seconds where the number has a decimal point.
+DWELLS = {"linuxcnc": "G4 P{:.0f}", "siemens840d": "G4 F{:.0f}", "fanuc": "G04 X{:.1f}"}
+_SPEEDS = ("1/min", "rpm", "min-1")
 
 
-def duty_lines(
+def propose_duty(
     sources: Sequence[str], *, effect: str, drift: str, noise: str, cycle: str, power: float, seed: int
-) -> list[str]:
+) -> xr.Dataset:
     """Propose a duty schedule: how long, with what power, and when to switch what."""
     named = [_source(text) for text in sources]
     machine = Machine(
@@ -40,7 +46,23 @@ def duty_lines(
         noise_um=read_option("--noise", noise, "um"),
         cycle_s=read_option("--cycle", cycle, "s"),
     )
-    proposed = plan_duty(machine, power=power, seed=seed)
+    return plan_duty(machine, power=power, seed=seed)
+
+
+def describe_duty(proposed: xr.Dataset) -> dict[str, object]:
+    """Return a duty schedule for other programs."""
+    return {
+        "hours": float(proposed["test_hours"]),
+        "mean_dwell_min": float(proposed["mean_dwell"]) / 60.0,
+        "power": float(proposed["power"].sel(hours=float(proposed["test_hours"])).max()),
+        "switchings": [
+            {"minute": minute, "source": name, "state": state} for minute, name, state in switchings(proposed)
+        ],
+    }
+
+
+def duty_lines(proposed: xr.Dataset, *, power: float) -> list[str]:
+    """Describe a duty schedule."""
     reached = float(proposed["power"].sel(hours=float(proposed["test_hours"])).max())
     longest = f"; no test of up to {float(proposed['hours'].max()):g} h reaches {power:.0%}"
     return [
@@ -53,34 +75,72 @@ def duty_lines(
     ]
 
 
-def next_test_lines(folder: Path, *, seed: int) -> list[str]:
-    """Propose the next test of a record's machine from what the last one left open."""
+def next_tests(folder: Path, largest: Sequence[str], *, seed: int) -> list[NextTest]:
+    """Return the tests that were tried for a record's machine, from what the last one left open."""
     results = read_results(folder)
     if not isinstance(results.loop, RecordLoop):
         raise DutyPlanError(
-            f"{folder}: the results of a [record] are needed; for a positioning test name its heat sources by --source"
+            f"{folder}: the results of a [record] are needed; for a positioning test name its heat sources by --source, and where a place "
+            'that the drift follows is to be told from the load that warms it, a mat or a fan at that place as well: --source "mat=20 min"'
         )
     product = read_product(folder, "record")
-    tests = list(propose_tests(product, results.loop, seed=seed))
-    now = tests[0].width_now_um
-    # The shortest that halves what is open, else the one that leaves least.
-    best = next((one for one in tests if one.width_um <= now / 2.0), min(tests, key=lambda one: one.width_um))
-    worst = ", ".join(f"{name} {um:.2g} um" for name, um in list(tests[0].open_um.items())[:_NAMED])
-    names = [str(name) for name in product["driver_name"].values]
-    units = [str(unit) for unit in product["driver_units"].values]
+    units = dict(zip(product["driver_name"].values.tolist(), product["driver_units"].values.tolist(), strict=True))
+    levels = dict(_level(text, units) for text in largest)
+    return list(propose_tests(product, results.loop, largest=levels, seed=seed))
+
+
+def next_test_lines(tests: Sequence[NextTest]) -> list[str]:
+    """Describe the tests that were tried, and the schedule of the one that is proposed."""
+    first, best = tests[0], choose_test(tests)
+
+    def sizes(um: Mapping[str, float], most: int | None = None) -> str:
+        return ", ".join(f"{name} {value:.2g} um" for name, value in list(um.items())[:most])
+
+    small = 1.0 - min(one.left for one in tests) < _WORTH_IT
+    nothing = f"no test of up to {tests[-1].hours:g} h lowers it by a tenth: what is left wanders or is noise, and needs a new zero"
     return [
-        f"standard uncertainty of a prediction under another duty: {now:.2g} um now; least known by itself: {worst}",
+        f"standard uncertainty of a prediction under another duty, over {first.over_h:.2g} h after a zero: {sizes(first.now_um)}; least "
+        f"known by itself: {sizes(first.open_um, _NAMED)}",
         *(
-            f"after {one.hours:g} h, mean time at one level {one.hold_min:g} min: {one.width_um:.2g} um"
+            f"after {one.hours:g} h, mean time at one level {one.hold_min:g} min: {sizes(one.after_um)}"
             for one in tests
         ),
+        *([nothing] if small else []),
         f"proposed: {best.hours:g} h",
-        "minute  " + "  ".join(f"{name} / {unit}" for name, unit in zip(names, units, strict=True)),
+        "minute  " + "  ".join(f"{name} / {unit}" for name, unit in best.units.items()),
         *(
             f"{minute:6.0f}  " + "  ".join(f"{level:g}" for level in row)
-            for minute, row in zip(best.minutes, best.levels, strict=True)
+            for minute, *row in zip(best.minutes, *best.levels.values(), strict=True)
         ),
     ]
+
+
+def write_nc_program(path: Path, test: NextTest, *, control: str) -> None:
+    """Write the schedule of a test as an NC program of spindle speeds and dwells, which moves no axis."""
+    if len(test.units) != 1 or next(iter(test.units.values())) not in _SPEEDS:
+        named = ", ".join(f"{name} / {unit}" for name, unit in test.units.items())
+        raise DutyPlanError(
+            f"--nc: a program sets the speed of one spindle in 1/min, and this record has {named}; set the levels by hand"
+        )
+    if control not in DWELLS:
+        raise DutyPlanError(f'--control "{control}" is not known; write one of {", ".join(DWELLS)}')
+    ends, (levels,) = [*test.minutes[1:], 60.0 * test.hours], test.levels.values()
+    lines = []
+    for start, end, level in zip(test.minutes, ends, levels, strict=True):
+        lines += [f"M3 S{level:.0f}" if level > 0.0 else "M5", DWELLS[control].format(60.0 * (end - start))]
+    path.write_text("\n".join([*lines, "M5", "M30", ""]), encoding="ascii")
+
+
+def _level(text: str, units: Mapping[str, str]) -> tuple[str, float]:
+    """Return a driver and its largest level from a text such as ``"spindle speed=12000"``."""
+    name, _, value = (part.strip() for part in text.partition("="))
+    number = value.removesuffix(units.get(name, "")).strip()
+    if name not in units or not number.replace(".", "", 1).isdigit() or float(number) == 0.0:
+        known = ", ".join(f'"{one}=12000 {unit}"' for one, unit in units.items())
+        raise DutyPlanError(
+            f'--largest "{text}" is no driver of this record with its highest level; write, for example, {known}'
+        )
+    return name, float(number)
 
 
 def _source(text: str) -> tuple[str, float]:

@@ -83,7 +83,8 @@ class RecursionOutput(ResultPart):
     before: float
     """Root mean square displacement of the hold-out set from the last value before it, without a correction."""
     u: float
-    """Standard uncertainty of the correction: root mean square error of predicting what the coefficients were not fitted to."""
+    """Standard uncertainty of the correction over the hours after a zero that a remark names: of a single run the root mean square error of
+    predicting what the coefficients were not fitted to, of several the one that is expected."""
 
 
 class SensorCurvePoint(ResultPart):

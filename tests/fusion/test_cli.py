@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -226,6 +227,8 @@ def test_plan_proposes_a_schedule_and_refuses_half_a_source() -> None:
     assert "heats or cools it alone" in told
     assert {row.split()[1] for row in rows} == {"spindle", "drive"}
     assert {row.split()[2] for row in rows} == {"on", "off"}
+    told = json.loads(invoke("plan", "--source", "spindle=40 min", "--source", "drive=15 min", "--json").stdout)
+    assert {one["source"] for one in told["switchings"]} == {"spindle", "drive"} and 0.0 < told["power"] <= 1.0
     for bad, message in (
         ("spindle", '--source "spindle" is no source; write its name and time constant, for example "spindle=40 min"'),
         ("spindle=40", '--source spindle "40": a time needs its unit in the value; write for example "37 s"'),
@@ -272,8 +275,21 @@ def test_a_record_of_hours_is_explained(tmp_path: Path) -> None:
     planned = invoke("plan", tmp_path / "out")
     assert planned.exit_code == 0, planned.output
     head, *lines = planned.output.splitlines()
-    assert head.startswith("standard uncertainty of a prediction under another duty: ")
+    assert head.startswith("standard uncertainty of a prediction under another duty, over ")
     assert lines[-1].split()[0].isdigit()
+    program = tmp_path / "duty.ngc"
+    told = invoke("plan", tmp_path / "out", "--json", "--largest", "spindle speed=12000 1/min", "--nc", program)
+    assert told.exit_code == 0, told.output
+    proposed = json.loads(told.stdout)["proposed"]
+    levels = proposed["levels"]["spindle speed"]
+    assert max(levels) == 12000.0 and set(proposed["now_um"]) == set(proposed["after_um"])
+    words = program.read_text().split()
+    dwells = [float(word[1:]) for before, word in itertools.pairwise(words) if before == "G4"]
+    speeds = [float(word[1:]) for before, word in itertools.pairwise(words) if before == "M3"]
+    assert sum(dwells) == pytest.approx(3600.0 * proposed["hours"], abs=1.0) and words[-2:] == ["M5", "M30"]
+    assert speeds == [one for one in levels if one]
+    for bad in (("--largest", "speed=3000"), ("--nc", program, "--control", "unknown")):
+        assert invoke("plan", tmp_path / "out", *bad).exit_code == 2
     refused = invoke("plan", tmp_path / "day")
     assert refused.exit_code == 2 and "results.json" in refused.stderr
 

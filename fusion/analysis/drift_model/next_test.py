@@ -1,14 +1,14 @@
-"""The next test of a record's machine: a random duty, and how much less the response leaves open after it."""
+"""The next test of a record's machine: a random duty, and the uncertainty of a correction that is expected after it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 
-from fusion.analysis.attribution.duty import DutyLaw, DutyPlanError
+from fusion.analysis.attribution.duty import DutyPlanError
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record
 from fusion.analysis.drift_model.recursion import (
     Marginal,
@@ -16,6 +16,8 @@ from fusion.analysis.drift_model.recursion import (
     columns_of,
     evaluate_columns,
     events_of,
+    expected_um,
+    part_s,
     record_of_product,
     respond,
 )
@@ -30,6 +32,8 @@ _MOST_ROWS = 10_000
 _LONGEST_STEP_S = 20.0 * min(_HOLDS_MIN)
 #: The duty under which a prediction is judged: hours of it, and its mean time at one level.
 _JUDGED_H, _JUDGED_HOLD_MIN = 24.0, 60.0
+#: Levels as shares of the largest: linear and quadratic heat differ.
+_SHARES = (0.0, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
@@ -39,70 +43,119 @@ class NextTest:
     Attributes
     ----------
     hours, hold_min : length, and mean time at one level
-    width_now_um, width_um : standard uncertainty of a prediction under another duty, mean over displacements, before and after it
-    open_um : the same now by what is read, the largest first
-    minutes, levels : time and level (n, drivers) of every change, from the first on, in the unit of each driver
+    over_h : hours after a zero for which an uncertainty holds
+    now_um, after_um : standard uncertainty of a prediction of every displacement before and after it
+    open_um : what is not known of the response to each reading by itself, the largest first
+    minutes, levels : time of every change, from the first on, and the levels of every driver then
+    units : unit of every driver
     """
 
     hours: float
     hold_min: float
-    width_now_um: float
-    width_um: float
+    over_h: float
+    now_um: dict[str, float]
+    after_um: dict[str, float]
     open_um: dict[str, float]
-    minutes: Array
-    levels: Array
+    minutes: list[float]
+    levels: dict[str, list[float]]
+    units: dict[str, str]
+
+    @property
+    def left(self) -> float:
+        """Mean over the displacements of the uncertainty after it over that before it."""
+        return float(np.mean([self.after_um[name] / um for name, um in self.now_um.items()]))
 
 
-def propose_tests(product: xr.Dataset, loop: RecordLoop, *, seed: int = 0) -> Iterator[NextTest]:
-    """Yield the best of the duties tried for every length of a test.
+def choose_test(tests: Sequence[NextTest]) -> NextTest:
+    """Return the shortest test that gains at least half of what the best of them gains."""
+    best = min(one.left for one in tests)
+    return next(one for one in tests if 1.0 - one.left >= (1.0 - best) / 2.0)
 
-    What the sensors will read is the response of each to the drivers in the record; the room is left out.
+
+def propose_tests(
+    product: xr.Dataset, loop: RecordLoop, *, largest: Mapping[str, float] | None = None, seed: int = 0
+) -> Iterator[NextTest]:
+    """Yield the best of the duties tried for every length of a test; `largest` is the highest level of a driver, if not that of the record.
+
+    What the sensors will read is the response of each to the drivers in the record, and beside it what they read beyond that: the room.
     """
     record = record_of_product(product)
     if not record.drivers:
         raise DutyPlanError(
             "the record holds no driver that changes; log speed, load or duty, which a next test can set"
         )
-    columns = columns_of(record, record.sensors)
-    every = np.ones(record.seconds.size, bool)
-    responses = respond(record, evaluate_columns(record, columns), events_of(product, loop), every)
+    columns, every = columns_of(record, record.sensors), np.ones(record.seconds.size, bool)
+    events = events_of(product, loop)
+    responses = respond(record, evaluate_columns(record, columns), events, every)
     loads = [one for one in columns if one.input in record.drivers]
-    none = np.empty((0, *record.rise.shape))
-    warmth = respond(replace(record, displacement=record.rise), evaluate_columns(record, loads), none, every)
+    warmed, none = evaluate_columns(record, loads), np.empty((0, *record.rise.shape))
+    warmth = respond(replace(record, displacement=record.rise), warmed, none, every)
     per_load = np.column_stack([one.coefficients for one in warmth])
+    longest = record.run == np.bincount(record.run).argmax()
+    room, at = (record.rise - warmed @ per_load)[longest], record.seconds[longest] - record.seconds[longest][0]
+    highest = {name: (largest or {}).get(name, size) / size for name, (size, _) in record.driver_sizes.items()}
     rng = np.random.default_rng(seed)
 
     def under(hours: float, hold_min: float) -> tuple[Record, Array]:
         step_s = min(max(record.block_s, 3600.0 * hours / _MOST_ROWS), _LONGEST_STEP_S)
         seconds = np.asarray(step_s * np.arange(round(3600.0 * hours / step_s)), float)
-        law = DutyLaw(60.0 * hold_min, 15.0 * hold_min)
-        # Rest, half and full: linear and quadratic heat differ.
-        shares = {name: np.mean([law.course(seconds, rng) for _ in range(2)], axis=0) for name in record.drivers}
+        shares = {name: highest[name] * _course(seconds, hold_min, rng) for name in record.drivers}
         drivers = {name: {power: share**power for power in EXPONENTS} for name, share in shares.items()}
         still = np.zeros((seconds.size, len(record.sensors)))
         test = replace(record, seconds=seconds, block_s=step_s, drivers=drivers, temperature=still, first=(0,), runs=())
-        test = replace(test, temperature=evaluate_columns(test, loads) @ per_load)
+        # The room of the record, forth and back where it is shorter.
+        there = at[-1] - abs(seconds % max(2.0 * at[-1], step_s) - at[-1])
+        beside = np.column_stack([np.interp(there, at, one) for one in room.T])
+        test = replace(test, temperature=evaluate_columns(test, loads) @ per_load + beside)
         return test, evaluate_columns(test, columns)
 
-    _, judged = under(_JUDGED_H, _JUDGED_HOLD_MIN)
-    judged = judged - judged.mean(axis=0)
-    now = [one.covariance for one in responses]
-    read = {name: [one.input == name for one in columns] for name in (*record.drivers, *record.sensors)}
-    open_um = {name: _width(now, judged * np.array(used)) for name, used in read.items()}
-    largest = dict(sorted(open_um.items(), key=lambda item: -item[1]))
+    test, judged = under(_JUDGED_H, _JUDGED_HOLD_MIN)
+    over_s = min(part_s(record), 3600.0 * _JUDGED_H)
+    now_um = expected_um(responses, test, judged, over_s)
+    open_um = {}
+    for name in (*record.drivers, *record.sensors):
+        read = judged * [one.input == name for one in columns]
+        open_um[name] = float(expected_um([replace(one, noise_um=0.0) for one in responses], test, read, over_s).mean())
+    open_um = dict(sorted(open_um.items(), key=lambda item: -item[1]))
     for hours in _HOURS:
         tried = []
         for hold_min in _HOLDS_MIN:
-            test, values = under(hours, hold_min)
-            steps = record.block_s / test.block_s
-            after = [covariance_after(one, test.seconds, values, steps=steps) for one in responses]
-            tried.append((_width(after, judged), hold_min, test))
-        width, hold_min, test = min(tried, key=lambda one: one[0])
-        sizes = np.array([record.driver_sizes[name][0] for name in test.drivers])
-        levels = np.column_stack([powers[1] for powers in test.drivers.values()]) * sizes
-        changed = np.flatnonzero(np.r_[True, (np.diff(levels, axis=0) != 0.0).any(axis=1)])
-        minutes = test.seconds[changed] / 60.0
-        yield NextTest(hours, hold_min, _width(now, judged), width, largest, minutes, levels[changed])
+            tried_test, values = under(hours, hold_min)
+            steps = record.block_s / tried_test.block_s
+            after = [
+                replace(one, covariance=covariance_after(one, tried_test.seconds, values, steps=steps))
+                for one in responses
+            ]
+            tried.append((expected_um(after, test, judged, over_s), hold_min, tried_test))
+        after_um, hold_min, best = min(tried, key=lambda one: float(np.mean(one[0] / now_um)))
+        shares = np.array([powers[1] for powers in best.drivers.values()])
+        changed = np.flatnonzero(np.r_[True, (np.diff(shares) != 0.0).any(axis=0)])
+        yield NextTest(
+            hours,
+            hold_min,
+            over_s / 3600.0,
+            now_um=dict(zip(record.channels, now_um.tolist(), strict=True)),
+            after_um=dict(zip(record.channels, after_um.tolist(), strict=True)),
+            open_um=open_um,
+            minutes=(best.seconds[changed] / 60.0).tolist(),
+            levels={
+                name: (size * share[changed]).tolist()
+                for (name, (size, _)), share in zip(record.driver_sizes.items(), shares, strict=True)
+            },
+            units={name: unit for name, (_, unit) in record.driver_sizes.items()},
+        )
+
+
+def _course(seconds: Array, hold_min: float, rng: np.random.Generator) -> Array:
+    """Draw the share of its largest level that a driver has at some times: another one after every hold, a quarter of the mean at least."""
+    share, until, courses = float(rng.choice(_SHARES)), 0.0, np.empty_like(seconds)
+    for place, now in enumerate(seconds):
+        if now >= until:
+            share = float(rng.choice([one for one in _SHARES if one != share]))
+            # In whole minutes.
+            until = now + 60.0 * max(round(0.25 * hold_min + rng.exponential(0.75 * hold_min)), 1)
+        courses[place] = share
+    return courses
 
 
 def covariance_after(one: Response, seconds: Array, values: Array, *, steps: float) -> Array:
@@ -116,8 +169,3 @@ def covariance_after(one: Response, seconds: Array, values: Array, *, steps: flo
     return np.asarray(
         np.linalg.inv(before + marginal.gram * np.outer(scale, scale) / noise_um**2) * np.outer(scale, scale)
     )
-
-
-def _width(covariances: list[Array], judged: Array) -> float:
-    """Return the standard uncertainty of what columns (n, p) predict, root mean square over time, mean over the displacements, um."""
-    return float(np.mean([np.sqrt(np.mean(np.sum((judged @ one) * judged, axis=1))) for one in covariances]))

@@ -1,8 +1,8 @@
 """What a record says of its displacements as first-order responses to its readings, and the recursion of it that a control runs.
 
 A control does not ask for names: every displacement is a sum of responses to every sensor and driver, at once and with time constants a
-factor of four apart, whatever the closed loop named or withheld. Its coefficients are those with which later parts of the record are
-predicted best from the last value before them (`follow`), and so is the hold-out (`forecast`).
+factor of four apart, whatever the closed loop named or withheld. Its coefficients are those with which later parts of a single run are
+predicted best from the last value before them (`follow`), and so is the hold-out (`forecast`); those of several runs are the most probable.
 What a second test says is judged by the distribution of such responses: coefficients are normal about zero, their standard deviation, the
 noise and the wandering those under which the record is most probable (evidence: MacKay 1992, Neural Computation 4, 415).
 """
@@ -22,7 +22,6 @@ from fusion.analysis.drift_model.predictions import (
     PENALTIES,
     channel_rmse,
     expected_error,
-    folds,
     last_values,
     rmse,
 )
@@ -269,7 +268,7 @@ class Following:
     kept : (p,) the columns that it may follow
     penalty : shrinkage of standardised coefficients; infinite where no reading predicts better than that it stays
     coefficients : (p,) um per unit of each column
-    missed_um : root mean square that it missed of the later parts; infinite where there are none
+    missed_um : root mean square that it missed of the later parts, infinite where there are none; of several runs what is expected
     """
 
     kept: NDArray[np.bool_]
@@ -283,8 +282,13 @@ def follow(
 ) -> list[Following]:
     """Return how every displacement follows columns (blocks, p) over some blocks, beside events (events, blocks, channels).
 
-    Chosen are the longest lag and the penalty with which later parts, or other runs, are predicted best from the last value before them.
+    Of a single run with the longest lag and the penalty that predict later parts best from the last value before them; of several by the
+    most probable response, whose error is the expected one.
     """
+    if np.unique(record.run[used]).size > 1:
+        every, whole = np.ones(len(columns), bool), respond(record, values, events, used)
+        missed_um = expected_um(whole, record, values, part_s(record))
+        return [Following(every, 0.0, one.coefficients, um) for one, um in zip(whole, missed_um.tolist(), strict=True)]
     choices = [
         np.array([one.time_constant_s <= lag_s for one in columns], bool)
         for lag_s in sorted({one.time_constant_s for one in columns})
@@ -312,9 +316,7 @@ def follow(
 def _later_parts(
     record: Record, used: NDArray[np.bool_], number: int = _PARTS
 ) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Blocks that are predicted and those before them: the later half of so many equal parts, or runs and all others."""
-    if np.unique(record.run[used]).size > 1:
-        return [(before, part) for before, part in folds(record, used) if before.any() and part.any()]
+    """Blocks of one run that are predicted and those before them: the later half of so many equal parts."""
     parts = [np.isin(np.arange(used.size), rows) for rows in np.array_split(np.flatnonzero(used), number) if rows.size]
     return [(np.logical_or.reduce(parts[:k]), parts[k]) for k in range(number // 2, len(parts))]
 
@@ -444,7 +446,8 @@ def make_recursion(
 ) -> Recursion:
     """Make the recursion of a record from ``fusion.nc`` and what the closed loop found, with steps of `sampling_s`.
 
-    Coefficients are from the whole record, uncertainties from parts of it that those of the other parts had not seen. `reduced` keeps the
+    Coefficients are from the whole record; uncertainties of a single run from parts of it that those of the other parts had not seen, of
+    several what is expected over the length of a part. `reduced` keeps the
     fewest sensors that lose at most 5 % beside all (`sensor_curve`); the hold-out set decides nothing. Raises a RecursionError if nothing
     is left that predicts.
     """
@@ -480,8 +483,12 @@ def make_recursion(
 
     before = channel_rmse((record.displacement - last_values(record, train))[~train])
     held_out = np.sqrt(known_mean(missed(train, ~train) ** 2, axis=0))
-    parts = [missed(everything & ~part, part) for part in _parts(record, everything)]
-    u = np.fmax(held_out, np.sqrt(known_mean(np.concatenate(parts) ** 2, axis=0)))
+    followed = follow(record, columns, values, events, everything)
+    if len(record.first) > 1:
+        u = np.array([one.missed_um for one in followed])
+    else:
+        parts = [missed(everything & ~part, part) for part in _parts(record, everything)]
+        u = np.fmax(held_out, np.sqrt(known_mean(np.concatenate(parts) ** 2, axis=0)))
     skilled = [k for k in range(len(record.channels)) if held_out[k] < before[k]]
     if not skilled or not columns:
         raise RecursionError("no displacement of the hold-out set is predicted better than by its last value")
@@ -490,12 +497,15 @@ def make_recursion(
         f"{BASELINE_LAGS_MIN[-1]:g} min, whatever the report names: error on the hold-out set from the last values before it "
         f"{float(known_mean(held_out)):.3g} um; the report's headline model, which is not started there, {loop.rmse_final_um:.3g} um"
     )
+    told.append(
+        f"uncertainties hold for about {part_s(record) / 3600.0:.2g} h after a zero: what no reading shows wanders on, and needs a new zero"
+    )
     told += [
         f"no correction of {name}: its hold-out set is predicted no better than by its last value"
         for k, name in enumerate(record.channels)
         if k not in skilled
     ]
-    whole = np.column_stack([one.coefficients for one in follow(record, columns, values, events, everything)])
+    whole = np.column_stack([one.coefficients for one in followed])
     inputs = _inputs(record, columns)
     told += [
         f"{one.name} was never negative in the test: hand over its magnitude, also for the other sense of rotation; a negative value "
@@ -530,6 +540,27 @@ def make_recursion(
         sensor_curve=tuple(curve),
         remarks=tuple(told),
     )
+
+
+def expected_um(responses: Sequence[Response], record: Record, values: Array, over_s: float) -> Array:
+    """Return the error that is expected (channels,) of predicting columns (blocks, p) for some time from a zero, um.
+
+    What is not known of the response, wandering and noise.
+    """
+    blocks = max(round(over_s / record.block_s), 1)
+    asked = values - values[np.arange(len(values)) // blocks * blocks]
+    return np.sqrt(
+        [
+            np.mean(np.sum((asked @ one.covariance) * asked, axis=1))
+            + one.noise_um**2 * (2.0 + one.ratio * over_s / 2.0)
+            for one in responses
+        ]
+    )
+
+
+def part_s(record: Record) -> float:
+    """Return the median length of the parts that an uncertainty was judged on, s."""
+    return record.block_s * float(np.median(np.unique(record.chained, return_counts=True)[1]))
 
 
 def _parts(record: Record, used: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:

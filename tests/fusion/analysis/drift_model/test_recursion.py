@@ -9,7 +9,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.readings import Series
 from fusion.analysis.attribution.duty import DutyPlanError
-from fusion.analysis.drift_model.next_test import covariance_after, propose_tests
+from fusion.analysis.drift_model.next_test import choose_test, covariance_after, propose_tests
 from fusion.analysis.drift_model.record import close_record
 from fusion.analysis.drift_model.record_data import Record, reduce_record
 from fusion.analysis.drift_model.recursion import (
@@ -251,7 +251,7 @@ def test_a_longer_test_leaves_less_open_also_where_the_record_has_long_blocks(bl
     displacement = series.lagged(3600.0 * 2 * block_h).values[:, None] * 9.0 + rng.normal(0.0, 0.1, (400, 1))
     temperature = 20.0 + series.lagged(3600.0 * block_h).values[:, None] * 4.0 + rng.normal(0.0, 0.01, (400, 1))
     _, product, loop = run_of(table_of(displacement, temperature, load, step_s=3600.0 * block_h))
-    widths = [one.width_um for one in propose_tests(product, loop)]
+    widths = [one.left for one in propose_tests(product, loop)]
     # Random duties differ: a longer one is worse by chance by a little at most.
     assert len(widths) == 4 and all(later < 1.2 * earlier for earlier, later in itertools.pairwise(widths))
 
@@ -267,18 +267,28 @@ def test_a_next_test_in_shorter_steps_than_the_blocks_leaves_as_much_open(rng):
 
 def test_a_next_test_leaves_less_open_and_says_what_is_open_now(driven):
     record, product, loop = driven
-    tests = list(propose_tests(product, loop))
+    tests = list(propose_tests(product, loop, largest={"speed": 9000.0}))
     assert [one.hours for one in tests] == [4.0, 8.0, 12.0, 24.0]
     for one in tests:
-        assert one.width_um < one.width_now_um == tests[0].width_now_um
-        assert one.minutes[0] == 0.0 and one.minutes[-1] < 60.0 * one.hours
-        # Rest, half and full, so that linear and quadratic heat differ.
-        assert set(np.unique(one.levels)) <= {share * record.driver_sizes["speed"][0] for share in (0.0, 0.5, 1.0)}
-    assert tests[-1].width_um < 0.8 * tests[-1].width_now_um
+        assert set(one.now_um) == set(one.after_um) == set(record.channels)
+        assert one.now_um == tests[0].now_um and one.left < 1.0
+        # Dwells of whole minutes, none shorter than a quarter of the mean; rest, half and full, so that linear and quadratic heat differ.
+        (levels,) = one.levels.values()
+        dwells = np.diff([*one.minutes, 60.0 * one.hours])
+        assert one.minutes[0] == 0.0 and dwells.min() > 0.0 and dwells[:-1].min() >= 0.25 * one.hold_min - 1.0
+        assert set(levels) <= {0.0, 4500.0, 9000.0} and np.diff(levels).all()
+    assert choose_test(tests) in tests and 1.0 - choose_test(tests).left >= 0.5 * (1.0 - min(one.left for one in tests))
     # What sensors of the same part tell is known for them together and not for each.
-    assert max(tests[0].open_um.values()) > tests[0].width_now_um
+    assert min(tests[0].open_um.values()) > 0.0
     with pytest.raises(DutyPlanError, match="log speed, load or duty"):
         next(propose_tests(product.isel(driver_name=slice(0)), loop.model_copy(update={"steps": ()})))
+
+
+def test_of_several_runs_the_uncertainty_is_that_of_all_of_them_and_no_more():
+    """A second run of half the length: to predict either from the other alone says nothing of both."""
+    _, product, loop = run_of(runs_table(5.0, -3.0))
+    (output,) = make_recursion(product, loop, sampling_s=60.0, **FROM).outputs
+    assert output.u < 0.01
 
 
 def wandering_record(rng: np.random.Generator, blocks: int = 200, *, follows: float = 2.0) -> Record:
