@@ -124,6 +124,8 @@ def write_nc_program(path: Path, test: NextTest, *, control: str) -> None:
         )
     if control not in DWELLS:
         raise DutyPlanError(f'--control "{control}" is not known; write one of {", ".join(DWELLS)}')
+    if path.exists():
+        raise DutyPlanError(f"--nc: {path} exists; name another file")
     ends, (levels,) = [*test.minutes[1:], 60.0 * test.hours], test.levels.values()
     lines = []
     for start, end, level in zip(test.minutes, ends, levels, strict=True):
