@@ -24,7 +24,7 @@ main()
 
 @pytest.mark.parametrize(
     ("library", "number"),
-    [("typer", signal.SIGINT), ("pydantic", signal.SIGINT), ("fusion.twin.recipe_file", signal.SIGTERM)],
+    [("typer", signal.SIGINT), ("fusion.twin.recipe_file", signal.SIGTERM)],
 )
 def test_a_signal_while_libraries_load_is_told_in_one_line(library: str, number: signal.Signals) -> None:
     text = LOADING.format(library=library, number=int(number))

@@ -115,11 +115,11 @@ def test_the_largest_of_noisy_values_is_covered():
     rng = np.random.default_rng(8)
     profile = np.stack([np.linspace(0, 15, 11) + 1.0, np.linspace(0, 15, 11) - 1.0])
     covered = 0
-    for _ in range(100):
+    for _ in range(50):
         result = evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (5, 2, 11))), budget=SCATTER_ALONE)
         covered += abs(float(result["B"]) - 2.0) <= 2 * float(result["B_u"])
-    # 0.93 of 400 such tests; three standard deviations of a share of 100 are 0.08.
-    assert covered >= 85
+    # 0.93 of 400 such tests; three standard deviations of a share of 50 are 0.11.
+    assert covered >= 41
 
 
 def test_a_negative_uncertainty_is_refused_and_a_temperature_below_20_degC_is_none():

@@ -358,11 +358,11 @@ def test_low_contrast_is_no_open_stretch_if_a_later_frame_shows_the_registration
     uniform = Scene(disc_K=-4.0, field=lambda x, y: 23.0 + 0.0 * x, outside=23.0)
     # Discs as warm as the table, and the table as warm as what surrounds it.
     shown, hidden = uniform.render(), replace(uniform, discs=()).render()
-    closed = reduced(tmp_path, rng, [shown, hidden, hidden, shown])
-    assert json.loads(closed.attrs["frames_unchecked"]) == ["a.seq#1", "a.seq#2"]
+    closed = reduced(tmp_path, rng, [shown, hidden, shown])
+    assert json.loads(closed.attrs["frames_unchecked"]) == ["a.seq#1"]
     assert json.loads(closed.attrs["unchecked_stretches"]) == []
-    opened = reduced(tmp_path, rng, [shown, shown, hidden, hidden])
-    assert json.loads(opened.attrs["unchecked_stretches"]) == [{"first": "a.seq#2", "last": "a.seq#3", "frames": 2}]
+    opened = reduced(tmp_path, rng, [shown, hidden, hidden])
+    assert json.loads(opened.attrs["unchecked_stretches"]) == [{"first": "a.seq#1", "last": "a.seq#2", "frames": 2}]
 
 
 def covered(above_K: float) -> np.ndarray:
@@ -438,13 +438,13 @@ def cut(series, spans=WHOLE, **options):
 
 
 def test_stretches_divide_short_and_long_recordings_and_end_at_registrations():
-    series = simulated(756_000, cycles=100)
+    series = simulated(151_200, cycles=20)
     stretches = cut(series)
     frames = [sum(portion.frames for portion in stretch) for stretch in stretches]
-    assert sum(frames) == 756_000
+    assert sum(frames) == 151_200
     assert max(frames) <= STRETCH_FRAMES
     # Cycles of 7,560 frames are two tasks each; with 5,000 frames/s, none takes less than half a second or more than one.
-    assert len(stretches) == 200
+    assert len(stretches) == 40
     assert min(frames) > 2500
     stretches = cut(simulated(4000, cycles=100))
     assert len(stretches) >= 14

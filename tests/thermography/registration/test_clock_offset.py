@@ -50,7 +50,7 @@ def test_frames_at_few_phases_of_the_motion_leave_the_offset_open_and_say_so():
 
 
 def test_feed_zero_and_rate_are_found_too(rng):
-    found = estimate_clock_offset(*campaign(rng, cycles=20, rate=50e-6))
+    found = estimate_clock_offset(*campaign(rng, cycles=16, rate=50e-6))
     assert found.feed_mm_per_min == pytest.approx(300, rel=0.005)
     assert found.start_mm == pytest.approx(40.0, abs=0.05)
     assert found.rate == pytest.approx(50e-6, abs=4 * found.rate_u)

@@ -60,11 +60,11 @@ def test_shifted_registration_puts_the_plan_where_the_picture_went(registration)
 
 def test_knock_while_the_discs_have_no_contrast_is_found_and_mended(rng, registration, tmp_path):
     moved = replace(BARE, shift_px=(3.0, -2.0))
-    images = [(BARE if i < 3 else moved).render(rng) for i in range(6)]
+    images = [(BARE if i < 2 else moved).render(rng) for i in range(4)]
     frames = record(tmp_path / "a.seq", images)
-    fields = reduce_frames(frames, registration, GRID, START + np.array([0, 3, 6]) * np.timedelta64(1, "s"))
+    fields = reduce_frames(frames, registration, GRID, START + np.array([0, 2, 4]) * np.timedelta64(1, "s"))
     (knock,) = json.loads(fields.attrs["knocks"])
-    assert knock["index"] == 3
+    assert knock["index"] == 2
     assert knock["shift_px"] == pytest.approx([3.0, -2.0], abs=0.1)
     error = fields["temperature"].values[1] - cell_truth()
     assert np.sqrt(np.nanmean(error**2)) < 0.01
@@ -94,9 +94,7 @@ def test_registration_after_a_knock_is_that_of_the_moved_table_or_names_the_fram
         register_after_knock(BARE.render(rng), registration, shift, GRID, frame_name="a.seq#7")
 
 
-@pytest.mark.parametrize(
-    ("zoom", "turn_deg", "shift"), [(1.02, 0.0, (0.0, 0.0)), (1.0, 1.0, (2.0, -1.0)), (0.99, -0.5, (0.0, 3.0))]
-)
+@pytest.mark.parametrize(("zoom", "turn_deg", "shift"), [(1.0, 1.0, (2.0, -1.0)), (0.99, -0.5, (0.0, 3.0))])
 def test_zoom_and_turn_are_measured_with_the_shift(rng, registration, zoom, turn_deg, shift):
     places = np.array([(d.column_px, d.row_px) for d in registration.located.values()])
     middle = places.mean(axis=0)

@@ -180,10 +180,9 @@ def test_three_wrong_places_of_twelve_are_named_and_do_not_bend_the_others(rng):
     assert scene.registration_rms_mm(registration) < 0.05
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_diameters_that_contradict_the_places_are_refused(rng, factor):
+def test_diameters_that_contradict_the_places_are_refused(rng):
     scene = Scene(disc_K=-4.0)
-    listed = [replace(d, diameter_mm=factor * d.diameter_mm) for d in hinted(scene, rng, 5)]
+    listed = [replace(d, diameter_mm=2.0 * d.diameter_mm) for d in hinted(scene, rng, 5)]
     with pytest.raises(RegistrationError, match="places and diameters of the fiducials contradict each other"):
         register(scene.render(rng), listed, grid=GRID)
 
