@@ -6,7 +6,7 @@ Terms that depend on more than the readings: on the model's other coefficients, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,6 +114,7 @@ class ModelFit:
     fit : the generalised least-squares fit to the used readings
     profile : (n, k) static columns that the used readings determine
     memory : of the noise of every site over the cycles
+    outlying : relative variances (n_used,) of readings far from the others, 1 for the rest
     """
 
     readings: Readings
@@ -122,6 +123,7 @@ class ModelFit:
     fit: DriftFit
     profile: Array
     memory: Autoregression = NO_MEMORY
+    outlying: Array = field(default_factory=lambda: np.ones(1))
 
     def place(self, term: Term) -> slice:
         """Where the coefficients of a term stand in the fit."""
@@ -234,7 +236,7 @@ def fit_model(
     memory = memory_of_each(np.nan_to_num(noise).T)
     # Coefficients of slow columns are means over many cycles, which noise with a memory makes less certain.
     fit = replace(fit, covariance=fit.covariance * max(memory.long_run, 1.0))
-    model = ModelFit(readings, used, tuple(terms), fit, profile, memory)
+    model = ModelFit(readings, used, tuple(terms), fit, profile, memory, first.system.variance)
     for combination, prior in model.priors():
         fit = condition(fit, combination, prior)
     return replace(model, fit=fit)

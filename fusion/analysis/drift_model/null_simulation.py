@@ -27,14 +27,15 @@ def simulate_null(
     memory: Autoregression = NO_MEMORY,
     site: NDArray[np.int64] | None = None,
     over: DriftSystem | None = None,
+    noise: Array | None = None,
 ) -> Array:
     """Simulate responses in which only the model's drift and noise act; the noise is resampled from the fit's residuals.
 
     ``memory`` is that of the noise of every site over the cycles, ``site`` (n,) that of every simulated reading; ``over`` are the readings
-    that are simulated, by default those of the fit.
+    that are simulated, by default those of the fit; ``noise`` (any,) is what is resampled, by default the fit's own, in its deviations.
     """
     system = over or fit.system
-    relative = fit.white_noise() * fit.sigma
+    relative = (fit.white_noise() if noise is None else noise) * fit.sigma
     # Some readings at a time, and those of a long test on disk: these are its largest numbers.
     drawn, scale = empty_array((system.seconds.size, draws), float), np.sqrt(system.independent)[:, None]
     blocks = _blocks(system.seconds.size)

@@ -35,6 +35,10 @@ READINGS_AGAIN = 10
 
 #: Share of hold-out sets whose error lies in the range that a model states, and how often such a set is simulated.
 _EXPECTED_PERCENT, _DRAWS = (2.5, 97.5), 400
+#: How many times beyond the limit of outliers (3 standard deviations) a reading may be and still is noise that comes again.
+_MOST_OUTLYING = 2.0
+#: A growth of the noise is looked for over more cycles than these.
+_FEWEST_FOR_GROWTH = 4
 
 
 def held_out_errors(errors: Mapping[str, Array]) -> dict[str, schema.HeldOutError]:
@@ -65,17 +69,47 @@ def expected_error(achieved: float, each: Array) -> schema.ModelError:
 
 def simulated_errors(model: ModelFit, rng: np.random.Generator) -> Array:
     """Errors (n_held_out, draws), um, of predicting simulated readings in which only what the model holds acts, in open loop."""
-    whole, sigma = model.whole_system(), model.fit.sigma
-    drawn = simulate_null(model.fit, rng, draws=_DRAWS, memory=model.memory, site=model.readings.site, over=whole)
-    missed, variance = whole.innovations(np.column_stack([model.whole_design(), drawn]))
-    laid = missed[model.used] / np.sqrt(variance[model.used, None])
+    whole, used, site, sigma = model.whole_system(), model.used, model.readings.site, model.fit.sigma
+    # Outliers of the training part come again, but none that is no noise.
+    outlying = np.minimum(model.outlying, _MOST_OUTLYING**2) / model.outlying
+    noise = model.fit.white_noise() * np.sqrt(outlying * model.fit.system.variance)
+    # Every site scatters as it did; the fit draws it to the others.
+    count, squares = (np.bincount(site[used], one, site.max() + 1) for one in (None, noise**2))
+    variance = (squares / np.maximum(count, 1))[site]
+    growth, level = _growth_ahead(model.readings.cycle, used, noise / np.sqrt(variance[used]), rng)
+    variance *= growth
+    noise /= np.sqrt(variance[used])
+    whole = replace(whole, variance=np.where(used, whole.variance, variance))
+    drawn = simulate_null(model.fit, rng, draws=_DRAWS, memory=model.memory, site=site, over=whole, noise=noise)
+    missed, spread = whole.innovations(np.column_stack([model.whole_design(), drawn]))
+    laid = missed[used] / np.sqrt(spread[used, None])
     known = np.reshape(
         [combination * (sigma / prior.u) for combination, prior in model.priors()], (-1, missed.shape[1] - _DRAWS)
     )
     laid = np.vstack([laid, np.column_stack([known, sigma * rng.standard_normal((len(known), _DRAWS))])])
     columns = missed.shape[1] - _DRAWS
     coefficients = np.linalg.lstsq(laid[:, :columns], laid[:, columns:], rcond=None)[0]
-    return np.asarray((missed[:, columns:] - missed[:, :columns] @ coefficients)[~model.used])
+    return np.asarray((missed[:, columns:] - missed[:, :columns] @ coefficients)[~used] * level)
+
+
+def _growth_ahead(
+    cycle: NDArray[np.int64], used: NDArray[np.bool_], noise: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Relative variance (n,) to which noise (n_used,) grows from the mean of the training part, as far as that stands out, and factors
+    (draws,) on what comes then, for what so many readings leave unknown of it.
+    """
+    cycles, of_used = np.unique(cycle[used], return_inverse=True)
+    squares = np.bincount(of_used, noise**2) / np.bincount(of_used)
+    relative, spread = np.ones(cycle.size), 0.0
+    if cycles.size > _FEWEST_FOR_GROWTH and squares.all():
+        (slope, _), covariance = np.polyfit(cycles - cycles.mean(), np.log(squares), 1, cov=True)
+        # James and Stein's estimate, its positive part, and what it leaves of the uncertainty.
+        kept = max(0.0, 1.0 - covariance[0, 0] / slope**2)
+        relative = np.exp(kept * slope * (cycle - cycles.mean()))
+        relative /= relative[used].mean()
+        spread = np.sqrt(kept * covariance[0, 0]) * (cycle[~used].mean() - cycles.mean()) / 2.0
+    again = np.mean(rng.choice(noise, (noise.size, _DRAWS)) ** 2, axis=0) / np.mean(noise**2)
+    return relative, np.sqrt(again) * np.exp(spread * rng.standard_normal(_DRAWS))
 
 
 def rmse(errors: Array) -> float:
