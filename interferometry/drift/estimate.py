@@ -72,12 +72,13 @@ def common_shape(residual: Array, known: Array) -> Array | None:
         return None
     remainder = _without(residual, known)
     whitened = remainder[1:] - _memory(remainder) * remainder[:-1]
-    value, shape = _first_mode(whitened)
+    values, vectors = np.linalg.eigh(_succession(whitened))
+    shape = vectors[:, -1]
     if 1.0 / float((shape**4).sum()) < LEAST_TARGETS:
         return None
     rng = np.random.default_rng(_SEED)
-    permuted = [_first_mode(rng.permutation(whitened))[0] for _ in range(_PERMUTATIONS)]
-    if (1 + np.count_nonzero(np.array(permuted) >= value)) / (_PERMUTATIONS + 1) > SHAPE_LEVEL:
+    permuted = [np.linalg.eigvalsh(_succession(rng.permutation(whitened)))[-1] for _ in range(_PERMUTATIONS)]
+    if (1 + np.count_nonzero(np.array(permuted) >= values[-1])) / (_PERMUTATIONS + 1) > SHAPE_LEVEL:
         return None
     return np.asarray(shape / shape[np.argmax(np.abs(shape))])
 
@@ -100,11 +101,10 @@ def _memory(remainder: Array) -> float:
     return max(0.0, float(np.median(product[square > 0] / square[square > 0]))) if (square > 0).any() else 0.0
 
 
-def _first_mode(series: Array) -> tuple[float, Array]:
-    """Largest eigenvalue of the symmetric covariance of successive rows, and its eigenvector."""
+def _succession(series: Array) -> Array:
+    """Symmetric covariance of successive rows."""
     product = series[:-1].T @ series[1:]
-    values, vectors = np.linalg.eigh(product + product.T)
-    return float(values[-1]), vectors[:, -1]
+    return np.asarray(product + product.T)
 
 
 #: Deletion residual, in standard deviations, from which a reading is flagged as an outlier: among 10,000 normal

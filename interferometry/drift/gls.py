@@ -739,20 +739,20 @@ def memory_of_each(values: Array) -> Autoregression:
     """
     if min(values.shape) <= 4 * _COMMON_PATTERNS:
         return NO_MEMORY
-    estimates = _lag_one_by_memory(*values.shape)
-    measured, independent = _lag_one(values), estimates[0]
+    measured, independent = _lag_one(values), _lag_one_by_memory(*values.shape, 1)[0]
     if measured < independent.mean() + _LEAST_MEMORY * independent.std(ddof=1):
         return NO_MEMORY
+    estimates = _lag_one_by_memory(*values.shape, _SIMULATED_MEMORY.size)
     weight = float(np.interp(measured, np.maximum.accumulate(estimates.mean(axis=1)), _SIMULATED_MEMORY))
     return Autoregression(np.array([weight]), 1.0 - weight**2)
 
 
 @lru_cache(maxsize=8)
-def _lag_one_by_memory(series: int, cycles: int) -> Array:
-    """What is estimated of every simulated memory, (memories, simulations); of one campaign all fits ask for the same shapes."""
+def _lag_one_by_memory(series: int, cycles: int, memories: int) -> Array:
+    """What is estimated of the first simulated memories, (memories, simulations); of one campaign all fits ask for the same shapes."""
     rng = np.random.default_rng(0)
-    estimates = np.empty((_SIMULATED_MEMORY.size, _SIMULATIONS))
-    for row, weight in zip(estimates, _SIMULATED_MEMORY, strict=True):
+    estimates = np.empty((memories, _SIMULATIONS))
+    for row, weight in zip(estimates, _SIMULATED_MEMORY[:memories], strict=True):
         memory = Autoregression(np.array([weight]), 1.0 - weight**2)
         row[:] = [_lag_one(memory.with_memory(rng.normal(size=(cycles, series))).T) for _ in row]
     return estimates

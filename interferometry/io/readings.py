@@ -574,7 +574,7 @@ def _read_labels(table: _Labelled, stated: Stated) -> Readings:
     if value is None:
         largest = f", the largest of which is {np.nanmax(np.abs(numbers), initial=0.0):g}"
         lacking["deviation_unit"] = f"no heading states the unit of the deviations{largest}"
-    if position is not None:
+    if position is not None and position.factor != 1.0:
         labels = [replace(label, position=label.position * position.factor) for label in labels]
     if isinstance(directed := _with_directions(table, labels, order, stated.directions), str):
         lacking["directions"] = directed
@@ -743,7 +743,8 @@ def _renumber(table: _Labelled, labels: list[_Label]) -> list[_Label]:
     kept = []
     for label, number, target in zip(labels, numbers, targets, strict=True):
         if number and target:
-            kept.append(replace(label, number=number, target=target))
+            same = (number, target) == (label.number, label.target)
+            kept.append(label if same else replace(label, number=number, target=target))
         else:
             given.left_out.add(label.line, "0", _NOT_FROM_ONE)
     return kept

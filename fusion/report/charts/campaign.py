@@ -163,7 +163,9 @@ def _correlation_charts(fused: xr.DataTree, channel: str, least_p: float | None)
         charts["sensitivity"] = model.plot_sensitivity(cells, channel)
     if "modes" in maps.children:
         modes = maps.children["modes"].to_dataset()
-        charts |= {f"mode_{mode}": model.plot_mode(modes, int(mode), channel, least_p) for mode in modes["mode"].values}
+        # The table has them all.
+        followed = modes["mode"].values[(modes["p_value"] <= ATTRIBUTION_LEVEL).any("channel").values]
+        charts |= {f"mode_{mode}": model.plot_mode(modes, int(mode), channel, least_p) for mode in followed}
     if "target_regions" in maps.children:
         region, targets = leading_region(maps), maps.children["target_regions"].to_dataset()
         charts["region_targets"] = model.plot_region_targets(targets, region, position)
