@@ -43,11 +43,11 @@ from fusion.analysis.drift_model.evaluation import (
     Surroundings,
     Unseen,
     answers,
-    describe_step,
+    describe_steps,
     leading_pattern,
     left_out_of_forecast,
+    named_in_forecast,
     unsupported_places,
-    withheld_for,
 )
 from fusion.analysis.drift_model.gains import Products, by_width, orthogonalise, reductions, sum_products
 from fusion.analysis.drift_model.model import (
@@ -293,7 +293,7 @@ def close_axis(
         },
         skill_um=problem.hold_out_error(state.model.terms) if late else state.errors_um[-1],
         tracking=track_cycles(problem.fitted(forecast), plain["ridge"]),
-        steps=steps,
+        steps=named_in_forecast(steps, away),
         away=frozenset(away),
         remainder=examine_remainder(state.model, seed, set_aside),
         wandering_um=wandering_um(state.model.fit),
@@ -935,18 +935,12 @@ def report_steps(
         is_smooth=model.fit.system.order == 2,
         total_um=_rms_about_sites(model.readings, model.readings.response),
     )
-    withheld = withheld_for(state, told, contributions, beside)
+    sizes = [model.size(term) for term in state.added]
+    cross_um = [(rmse(without), rmse(within)) for without, within in crossed]
+    described = describe_steps(state, told, contributions, beside, sizes=sizes, cross_um=cross_um)
     return [
         AddedEffect(
-            **describe_step(
-                state,
-                place,
-                told[place],
-                withheld[place],
-                size=model.size(term),
-                rms_um=contributions[place].rms_um,
-                cross_um=(rmse(crossed[place][0]), rmse(crossed[place][1])),
-            ),
+            **described[place],
             coefficients=coefficients_of(averaged, term),
             held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
             cross_errors_before_um=crossed[place][0],

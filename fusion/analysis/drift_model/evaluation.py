@@ -277,17 +277,6 @@ class Surroundings:
     of_own_law: Collection[str] = ()
 
 
-def withheld_for(
-    state: LoopState[M], answers: Sequence[Answer], contributions: Sequence[Contribution], beside: Surroundings
-) -> list[str]:
-    """Say why added effects have no name, in turn; empty for those that have one."""
-    withheld: list[str] = []
-    for step, answer, own in zip(state.steps, answers, contributions, strict=True):
-        before = list(zip(state.added, contributions, withheld, strict=False))
-        withheld.append(next(reasons_against(step, answer, own, before, beside), ""))
-    return withheld
-
-
 def reasons_against(
     step: Step,
     answer: Answer,
@@ -332,44 +321,49 @@ def reasons_against(
         yield say("withheld", "needless", loss=own.loss)
 
 
-def describe_step(
+def describe_steps(
     state: LoopState[M],
-    place: int,
-    answer: Answer,
-    withheld: str,
+    answers: Sequence[Answer],
+    contributions: Sequence[Contribution],
+    beside: Surroundings,
     *,
-    size: float,
-    rms_um: float,
-    cross_um: tuple[float, float],
-) -> dict[str, Any]:
-    """What results.json holds of every step, on a record and along an axis; ``size`` is as in `rivals`, ``cross_um`` are the errors of
-    predicting left-out blocks without it and with it.
+    sizes: Sequence[float],
+    cross_um: Sequence[tuple[float, float]],
+) -> list[dict[str, Any]]:
+    """What results.json holds of every step, on a record and along an axis; ``sizes`` are as in `rivals`, ``cross_um`` the errors of
+    predicting left-out blocks without each and with it.
     """
-    step = state.steps[place]
-    tied, runner_up = rivals(step.score, step.round.scores, size)
-    before_um, after_um, without_um = (np.nan,) * 3
-    if not step.is_from_second_search:
-        before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
-    # The hold-out set does not show when an event happened before it.
-    unseen_um = cross_um if np.isnan(without_um) or step.score.is_event else (without_um, state.errors_um[-1])
-    return {
-        "effect": step.effect,
-        "parameters": state.added[place].candidate.parameters,
-        "parameter_ranges": step.score.ranges,
-        "p_value": step.score.family_wise_p,
-        "rmse_before_um": before_um,
-        "rmse_after_um": after_um,
-        "rmse_without_um": without_um,
-        "cross_rmse_before_um": cross_um[0],
-        "cross_rmse_after_um": cross_um[1],
-        "rms_um": rms_um,
-        "tied": tied,
-        "lowers_error": unseen_um[1] * schema.ERROR_BY_CHANCE < unseen_um[0],
-        "withheld": withheld,
-        "runner_up": runner_up,
-        **answer.described(),
-        "confirmed_by": str(step.confirmed),
-    }
+    described: list[dict[str, Any]] = []
+    for place, (step, answer, own) in enumerate(zip(state.steps, answers, contributions, strict=True)):
+        before = zip(state.added, contributions, (one["withheld"] for one in described), strict=False)
+        tied, runner_up = rivals(step.score, step.round.scores, sizes[place])
+        before_um, after_um, without_um = (np.nan,) * 3
+        if not step.is_from_second_search:
+            before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
+        # The hold-out set does not show when an event happened before it.
+        is_unseen = np.isnan(without_um) or step.score.is_event
+        unseen_um = cross_um[place] if is_unseen else (without_um, state.errors_um[-1])
+        described.append(
+            {
+                "effect": step.effect,
+                "parameters": state.added[place].candidate.parameters,
+                "parameter_ranges": step.score.ranges,
+                "p_value": step.score.family_wise_p,
+                "rmse_before_um": before_um,
+                "rmse_after_um": after_um,
+                "rmse_without_um": without_um,
+                "cross_rmse_before_um": cross_um[place][0],
+                "cross_rmse_after_um": cross_um[place][1],
+                "rms_um": own.rms_um,
+                "tied": tied,
+                "lowers_error": unseen_um[1] * schema.ERROR_BY_CHANCE < unseen_um[0],
+                "withheld": next(reasons_against(step, answer, own, list(before), beside), ""),
+                "runner_up": runner_up,
+                **answer.described(),
+                "confirmed_by": str(step.confirmed),
+            }
+        )
+    return described
 
 
 # What follows from it: whether the model has skill, and the verdict.

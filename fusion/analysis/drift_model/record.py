@@ -37,13 +37,12 @@ from fusion.analysis.drift_model.evaluation import (
     Surroundings,
     Unseen,
     answers,
-    describe_step,
+    describe_steps,
     exceeds_noise,
     leading_pattern,
     left_out_of_forecast,
     named_in_forecast,
     unsupported_places,
-    withheld_for,
 )
 from fusion.analysis.drift_model.gains import Gains, by_width, profile_gains
 from fusion.analysis.drift_model.model import (
@@ -1012,36 +1011,20 @@ class RecordResult(LoopResult):
 
 
 def report_steps(
-    record: Record,
-    state: RecordState,
-    answers: Sequence[Answer],
-    contributed: Sequence[Array],
-    withheld: Sequence[str],
-    left_out: Sequence[Array],
+    record: Record, state: RecordState, described: Sequence[Mapping[str, Any]], contributed: Sequence[Array]
 ) -> list[schema.RecordStep]:
-    """Describe the steps of a loop whose hold-out set has been opened, with what unseen blocks say of them."""
-    cross_um = [rmse(record.displacement - predicted) for predicted in left_out]
+    """Describe the steps of a loop by channel, beside what is said of the steps of every loop."""
     return [
         schema.RecordStep(
-            **describe_step(
-                state,
-                place,
-                answers[place],
-                withheld[place],
-                size=step.score.gain,
-                rms_um=np.sqrt(np.mean(squares)),
-                cross_um=(cross_um[1 + place], cross_um[0]),
-            ),
-            rms_by_channel_um={name: np.sqrt(np.mean(squares[:, k])) for k, name in enumerate(record.channels)},
+            **one,
+            rms_by_channel_um=dict(zip(record.channels, np.sqrt(np.mean(series**2, axis=0)), strict=True)),
             chained_rmse_before_um=step.round.start_error_um,
             chained_rmse_after_um=step.score.error_um,
             rejected=_rejected(step.round),
             event_s=term.candidate.parameters.get("time_s", term.candidate.event_s),
             sizes_um=term.candidate.sizes(record.channels) if isinstance(term.candidate, Event) else {},
         )
-        for place, (step, term, squares) in enumerate(
-            zip(state.steps, state.added, [series**2 for series in contributed], strict=True)
-        )
+        for step, term, one, series in zip(state.steps, state.added, described, contributed, strict=True)
     ]
 
 
@@ -1097,7 +1080,8 @@ def close_record(
     contributions = [one - one.mean(axis=0) for one in series]
     contributed = contributions[len(state.declared) :]
     drift_um = float(np.mean([wandering_um(fit) for fit in whole.channels]))
-    withheld = withheld_for(
+    error_um, *without_um = (rmse(record.displacement - one) for one in left_out)
+    described = describe_steps(
         state,
         told,
         [
@@ -1110,8 +1094,10 @@ def close_record(
             total_um=float(np.sqrt(np.nanmean((record.displacement - np.nanmean(record.displacement, axis=0)) ** 2))),
             of_own_law={"unseen_heat_source"},
         ),
+        sizes=[step.score.gain for step in state.steps],
+        cross_um=[(without, error_um) for without in without_um],
     )
-    steps = report_steps(record, state, told, contributed, withheld, left_out)
+    steps = report_steps(record, state, described, contributed)
     away = left_out_of_forecast(problem, state, unsupported_places(steps))
     kept = state.kept(away)
     of_declared, of_final = problem.predict(state.declared), problem.predict(kept)

@@ -334,10 +334,8 @@ def reduce_record(table: xr.Dataset, *, constants: Collection[str] = ()) -> Reco
     blocks = _lay_blocks(table, elapsed)
     drivers, driver_sizes, constant_drivers = _drivers(table, blocks, constants)
     chained = _chained_runs(blocks, [powers[1] for powers in drivers.values()])
-    means = {
-        str(name): blocks.zeroed(values)
-        for name, values in zip(table["channel"].values, table["displacement"].values.T, strict=True)
-    }
+    moved = dict(zip(map(str, table["channel"].values), table["displacement"].values.T, strict=True))
+    means = {name: blocks.zeroed(values) for name, values in moved.items()}
     faults = {name: blocks.fault_of(mean, chained) for name, mean in means.items()}
     channels = tuple(name for name in means if not faults[name])
     if not channels:
@@ -352,10 +350,7 @@ def reduce_record(table: xr.Dataset, *, constants: Collection[str] = ()) -> Reco
             f"{blocks.source}: no temperature changes; nothing that a displacement could follow; add sensors that warm"
         )
     per_block = max(1.0, elapsed.size / blocks.seconds.size)
-    measured = dict(zip(sensors, samples.T, strict=True))
-    measured |= {
-        str(name): values for name, values in zip(table["channel"].values, table["displacement"].values.T, strict=True)
-    }
+    measured = {**dict(zip(sensors, samples.T, strict=True)), **moved}
     digits = {name: resolution(values) for name, values in measured.items()}
 
     def step(name: str) -> float:

@@ -199,6 +199,19 @@ class Response:
     noise_um: float
     ratio: float
 
+    def left_open(self, columns: Array) -> Array:
+        """What is not known of the response to columns (n, p): as many, with independent coefficients of unit variance, um."""
+        sizes, directions = np.linalg.eigh(self.covariance)
+        return np.asarray(columns @ (directions * np.sqrt(np.maximum(sizes, 0.0))))
+
+    def draw(self, seconds: Array, columns: Array, rng: np.random.Generator, *, draws: int) -> Array:
+        """Courses (n, draws), um, that respond to columns (n, p), wander and are noisy as this response leaves possible."""
+        steps, shape = np.diff(seconds, prepend=seconds[0]), (seconds.size, draws)
+        walk = np.cumsum(np.sqrt(self.ratio * steps)[:, None] * rng.standard_normal(shape), axis=0)
+        course = self.left_open(columns) @ rng.standard_normal((self.coefficients.size, draws))
+        course += self.noise_um * (walk + rng.standard_normal(shape))
+        return np.asarray(course + (columns @ self.coefficients)[:, None])
+
 
 def respond(record: Record, columns: Array, events: Array, used: NDArray[np.bool_]) -> list[Response]:
     """Return the response of every displacement to columns (blocks, p) over some blocks, beside a constant of every run and events
@@ -366,12 +379,7 @@ def _drawn_errors(
     as long as the hold-out, were missed by beyond that enlarges them.
     """
     # The same draws for all: the drifts of the channels of one machine are alike.
-    rng, shape = np.random.default_rng(seed), (record.seconds.size, _DRAWS)
-    steps = np.sqrt(response.ratio * np.diff(record.seconds, prepend=record.seconds[0]))[:, None]
-    drawn = response.noise_um * (np.cumsum(steps * rng.standard_normal(shape), axis=0) + rng.standard_normal(shape))
-    sizes, directions = np.linalg.eigh(response.covariance)
-    open_ = directions * np.sqrt(np.maximum(sizes, 0.0)) @ rng.standard_normal((sizes.size, _DRAWS))
-    drawn += values @ (response.coefficients[:, None] + open_)
+    drawn = response.draw(record.seconds, values, np.random.default_rng(seed), draws=_DRAWS)
 
     def missed(courses: Array, known: NDArray[np.bool_]) -> Array:
         fitted = _regress(record, courses, values[:, one.kept], events, known)[one.penalty == _PENALTIES][0]

@@ -208,9 +208,8 @@ class _Second:
 
     @property
     def _left_open(self) -> Array:
-        """What the first test left open of the response: columns (n, p) with independent coefficients of unit variance, um."""
-        values, vectors = np.linalg.eigh(self.response.covariance)
-        return self.columns @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        """What the first test left open of the response."""
+        return self.response.left_open(self.columns)
 
     @property
     def _bare(self) -> Array:
@@ -219,13 +218,8 @@ class _Second:
 
     def draw_ranges(self, *, seed: int = 1) -> Array:
         """Draw the range that the correction leaves (draws,), um: response, wandering and noise as the first test knows them."""
-        rng = np.random.default_rng(seed)
-        one, steps = self.response, np.diff(self.seconds, prepend=self.seconds[0])
-        size = (self.seconds.size, _DRAWS)
-        walk = np.cumsum(np.sqrt(one.ratio * steps)[:, None] * rng.standard_normal(size), axis=0)
-        left = self._left_open @ rng.standard_normal((one.coefficients.size, _DRAWS))
-        left += one.noise_um * (walk + rng.standard_normal(size))
-        return np.asarray(np.ptp(left + (self.course - self._bare + self.correction)[:, None], axis=0))
+        left = self.response.draw(self.seconds, self.columns, np.random.default_rng(seed), draws=_DRAWS)
+        return np.asarray(np.ptp(left + self.correction[:, None], axis=0))
 
     def gain(self) -> tuple[float, float]:
         """Return the gain with which the correction acted and its standard uncertainty."""

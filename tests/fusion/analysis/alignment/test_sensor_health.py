@@ -131,6 +131,14 @@ def test_a_rail_is_no_reading_and_a_hot_sensor_is_one(rail, places, found):
     assert no_readings(spoilt).sum() == found
 
 
+@pytest.mark.parametrize(("level", "found"), [(200.0, 0), (60.5, 0), (200.3, 100), (700.0, 100), (-30.0, 100)])
+def test_a_level_that_a_heater_may_hold_to_the_digit_is_no_rail(level: float, found: int):
+    """Switched on between two readings that lie far apart; no set point is below all others, nor in tenths of a degree."""
+    values = np.round(20.0 + np.random.default_rng(6).normal(0.0, 0.5, 600), 1)
+    values[300:400] = level
+    assert no_readings(values).sum() == found
+
+
 def test_a_set_point_is_found_with_what_it_regulates():
     seconds = 10.0 * np.arange(900)
     wanted = np.select([seconds < 900, seconds < 4000, seconds < 6000], [0.0, 70.0, 60.0], 0.0)

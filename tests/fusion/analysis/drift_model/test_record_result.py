@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusion.analysis.drift_model import record as module
-from fusion.analysis.drift_model.evaluation import Answer
+from fusion.analysis.drift_model.evaluation import Answer, Contribution, Surroundings, describe_steps
 from fusion.analysis.drift_model.model import Term
 from fusion.analysis.drift_model.predictions import held_out_errors, track_record
 from fusion.analysis.drift_model.record import (
@@ -71,6 +71,14 @@ def result(*, shape: str = "") -> RecordResult:
     left_out = [np.full((4, 2), 0.6), np.full((4, 2), 1.8)]
     # About its mean of 1 the load's course is -1, 0, 0, 1; coefficients of 2 and -4.
     contributed = np.array([-1.0, 0.0, 0.0, 1.0])[:, None] * [2.0, -4.0]
+    described = describe_steps(
+        state,
+        [Answer(1.0, 0.1, 50)],
+        [Contribution(float(np.sqrt(np.mean(contributed**2))), np.array([1.0, 0.0]), 10.0)],
+        Surroundings(0.0, False, 10.0),
+        sizes=[chosen.gain],
+        cross_um=[(1.8, 0.6)],
+    )
     return predicting(
         RecordResult(
             state=state,
@@ -80,7 +88,7 @@ def result(*, shape: str = "") -> RecordResult:
             hold_out={},
             skill_um=0.5,
             tracking=None,
-            steps=report_steps(record, state, [Answer(1.0, 0.1, 50)], [contributed], [""], left_out),
+            steps=report_steps(record, state, described, [contributed]),
             away=frozenset(),
             remainder=RecordRemainder(0.5, {"periodicity": 0.5}, shape, 0.0, np.array([0.1, 0.3])),
             wandering_um=0.15,

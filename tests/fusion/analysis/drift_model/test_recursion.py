@@ -316,6 +316,18 @@ def test_the_forecast_from_the_last_value_does_not_know_what_follows(rng):
     assert (np.diff(one.u[160:, 0])[[0, 5, 20]] > -0.05).all()
 
 
+def test_a_forecast_is_wide_where_a_reading_does_what_the_training_time_did_not_show(rng):
+    """A temperature that rests in training says nothing of the displacement; the hold-out in which it moves is as open as the response."""
+    record, widths = wandering_record(rng), []
+    for moved_K in (0.0, 10.0):
+        temperature = record.temperature.copy()
+        temperature[:, 1] = 20.0 + 0.01 * np.sin(np.arange(200.0)) + moved_K * (np.arange(200) >= 170)
+        found = forecast(replace(record, temperature=temperature), np.zeros((0, 200, 1)), np.arange(200) < 160)
+        widths.append(found.u[160:, 0])
+    np.testing.assert_allclose(widths[1][:10], widths[0][:10])
+    assert (widths[1][15:] > 3.0 * widths[0][15:]).all()
+
+
 def test_a_displacement_that_follows_no_reading_stays_at_its_last_value(rng):
     record = wandering_record(rng, follows=0.0)
     train, columns = np.arange(200) < 160, columns_of(record, record.sensors)
