@@ -592,7 +592,8 @@ def _stuck(
         known = np.flatnonzero(np.isfinite(temperature[:, k]))
         values = temperature[known, k]
         length, first, ordinary = _longest_run(values)
-        if length < max(_LEAST_REPEATED, limit * ordinary):
+        rest = np.delete(values, slice(first, first + length))
+        if length < max(_LEAST_REPEATED, limit * max(ordinary, _by_chance(rest == values[first]))):
             continue
         run = known[first : first + length]
         others = [j for j in kept if j != k]
@@ -604,12 +605,17 @@ def _stuck(
             continue
         first_s, last_s = float(seconds[run[0]]), float(seconds[run[-1]])
         inside = (grid.seconds >= first_s) & (grid.seconds <= last_s)
-        rest = np.delete(values, slice(first, first + length))
         restless = ordinary <= _ORDINARY_RUN and _is_fine(rest)
         if restless or _has_noise(rest) or _moved_alone(grid, k, moving, inside):
             step, ratio = float(np.median(np.diff(seconds))), length / max(ordinary, 1)
             faults.append(SensorFault(k, Kind.STUCK, True, first_s, step, 0.0, ratio, limit))
     return faults
+
+
+def _by_chance(is_value: NDArray[np.bool_]) -> float:
+    """Longest run of a value that readings repeat by chance as often as these do, as rounded noise does (Erdos and Renyi 1970)."""
+    often = float(np.clip(is_value.mean() if is_value.size else 0.0, 1e-9, 1.0 - 1e-9))
+    return float(np.log(max(is_value.size * (1.0 - often), 1.0)) / -np.log(often))
 
 
 def _is_fine(values: Array) -> bool:

@@ -139,6 +139,16 @@ def test_a_level_that_a_heater_may_hold_to_the_digit_is_no_rail(level: float, fo
     assert no_readings(values).sum() == found
 
 
+@pytest.mark.parametrize(("repeated", "stuck"), [(28, False), (300, True)])
+def test_rounded_noise_repeats_its_most_frequent_value_by_chance(repeated: int, stuck: bool):
+    """Three readings of four are 12.0, so that 20 in a row are expected among 2000."""
+    rng, seconds = np.random.default_rng(8), 2.0 * np.arange(2000)
+    coarse = np.where(rng.random(2000) < 0.75, 12.0, 12.0 + rng.choice([-0.5, 0.5], 2000))
+    coarse[900 : 900 + repeated] = 12.0
+    found = examine_sensors(seconds, np.column_stack([coarse, wandering(2000, 3)]))
+    assert [(one.sensor, one.kind) for one in found] == ([(0, Kind.STUCK)] if stuck else [])
+
+
 def test_a_set_point_is_found_with_what_it_regulates():
     seconds = 10.0 * np.arange(900)
     wanted = np.select([seconds < 900, seconds < 4000, seconds < 6000], [0.0, 70.0, 60.0], 0.0)
