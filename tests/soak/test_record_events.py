@@ -30,8 +30,7 @@ KINDS = {
     "creep": (0.3, 1.0, 0.0),
     "settling": (0.1, 1.0, 0.5),
 }
-#: From this size on, in standard deviations of a reading, an event is to be found.
-LARGE = 6.0
+LARGE = 6.0  # From this size on, in standard deviations of a reading, an event is to be found.
 
 
 @dataclass(frozen=True)
@@ -84,9 +83,7 @@ def simulated(rng: np.random.Generator, kinds: list[str], *, everywhere: bool) -
 
 def events(table: xr.Dataset) -> list[Event]:
     record = reduce_record(table)
-    samples, train = record.readings, hold_out(record)[0]
-    used, switched = train[samples.block], record.switched()[samples.block]
-    return find_events(samples, used, record.displacement_step, switched)[0]
+    return find_events(record, hold_out(record)[0])[0]
 
 
 def is_of(event: Event, one: Happened, step_s: float) -> bool:
@@ -118,8 +115,7 @@ def test_events_are_found_dated_and_sized_and_none_is_where_nothing_happens(caps
         with capsys.disabled():
             told = {"large found": large, "onset": dated, "duration": lasted, "size": sized, "false records": false}
             print(f"{kind}, all so far: " + "; ".join(f"{name} {sum(one)}/{len(one)}" for name, one in told.items()))
-    with capsys.disabled():
-        print(f"large found {rate(sum(large), len(large))}; false records {rate(sum(false), len(false))}")
+            print(f"large found {rate(sum(large), max(1, len(large)))}; false records {rate(sum(false), len(false))}")
     assert np.mean(false) <= 0.02 + 3.0 * np.sqrt(0.02 / len(false))
     # Intervals of 95 % and 2 u, less three standard deviations of a count of some fifty.
     assert np.mean(large) >= 0.6 and np.mean(dated) >= 0.85 and np.mean(sized) >= 0.88

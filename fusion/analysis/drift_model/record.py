@@ -68,7 +68,7 @@ from fusion.analysis.drift_model.predictions import (
     track_record,
 )
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, RecordError, independent, reduce_record
-from fusion.analysis.drift_model.record_events import Event, find_events, laid_on_blocks
+from fusion.analysis.drift_model.record_events import Event, find_events
 from fusion.analysis.drift_model.recursion import FOLLOWED, Anchored, forecast
 from fusion.analysis.drift_model.search import (
     BUILT_IN,
@@ -579,11 +579,9 @@ class RecordProblem(Problem[RecordFit]):
 
     def _with_events(self, state: RecordState) -> RecordState:
         """The state with the events of the training part, those that explain most first."""
-        samples, error_um = self.record.readings, self.predict(state.model.terms).chained_rmse
-        used, switched = (each[samples.block] for each in (self.train, self.record.switched()))
-        found, decisions = find_events(samples, used, self.record.displacement_step, switched)
-        scores = []
-        for event in (laid_on_blocks(one, samples, self.train.size) for one in found):
+        found, decisions = find_events(self.record, self.train)
+        error_um, scores = self.predict(state.model.terms).chained_rmse, []
+        for event in found:
             gain = float(channel_gains(state.model, [event]).gain[0, 0])
             after_um = self.predict([*state.declared, Term(STEP_EVENT.name, event)]).chained_rmse
             ranges = {"time_s": event.onset.ends(), "duration_min": event.duration.ends(60.0)}

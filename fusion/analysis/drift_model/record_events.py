@@ -16,7 +16,7 @@ from scipy import linalg, optimize
 
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.drift_model.evaluation import Answer
-from fusion.analysis.drift_model.record_data import Samples
+from fusion.analysis.drift_model.record_data import Record, Samples
 from fusion.analysis.drift_model.search import Decision, Reason
 from fusion.analysis.effects.effect import Candidate
 from fusion.analysis.levels import RECORD_ENTRY_LEVEL
@@ -121,15 +121,6 @@ class Event(Candidate):
         return {name: Quantity(value=value, u=u) for name, value, u in told if value}
 
 
-def laid_on_blocks(event: Event, samples: Samples, blocks: int) -> Event:
-    """The same event with its course as means over the blocks of a record (blocks, 1)."""
-    shares = event.course.at(samples.seconds)
-    number = np.bincount(samples.block, minlength=blocks)
-    return replace(
-        event, columns=(np.bincount(samples.block, shares, minlength=blocks) / np.maximum(number, 1))[:, None]
-    )
-
-
 class _Seen(NamedTuple):
     """The change that is most out of proportion: its window begins at cell `at`, lasts `gap` cells between means of `mean` cells."""
 
@@ -140,15 +131,13 @@ class _Seen(NamedTuple):
     channel: int
 
 
-def find_events(
-    samples: Samples, used: NDArray[np.bool_], digits: Array, switched: NDArray[np.bool_]
-) -> tuple[list[Event], list[Decision]]:
-    """Find the events in the used samples, those that explain most of a channel first, and what belongs to a load instead.
-
-    ``digits`` (channels,) um are the steps of the readings: what moves none by more is no event. ``switched`` (samples,) says where a
-    driver is switched.
+def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], list[Decision]]:
+    """Find the events in the raw readings of the used blocks, those that explain most of a channel first, and what belongs to a load
+    instead. Each has its course on all blocks.
     """
-    cells, found, decisions = _Cells.of(samples, used), list[Event](), list[Decision]()
+    samples, digits = record.readings, record.displacement_step
+    inside, switched = (each[samples.block] for each in (used, record.switched()))
+    cells, found, decisions = _Cells.of(samples, inside), list[Event](), list[Decision]()
     if cells is None:
         return [], []
     while (seen := cells.most_striking()) is not None:
@@ -176,6 +165,10 @@ def find_events(
         return [], decisions
     left = cells.response - cells.moved @ cells.slopes[cells.windows()[-1]]
     spread = np.nanvar(left[:, ~many], axis=0) + np.finfo(float).tiny
+    number = np.maximum(np.bincount(samples.block, minlength=used.size), 1)
+    # On a block an event is the mean of its course over the readings there.
+    laid = [np.bincount(samples.block, one.course.at(samples.seconds), used.size) / number for one in found]
+    found = [replace(one, columns=course[:, None]) for one, course in zip(found, laid, strict=True)]
     return sorted(found, key=lambda one: -float(np.max(one.size[~many] ** 2 / spread))), decisions
 
 
