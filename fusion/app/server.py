@@ -33,17 +33,7 @@ from tornado.ioloop import IOLoop
 from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
-from fusion.app.parts import (
-    PathError,
-    ReportHandler,
-    State,
-    column,
-    note,
-    schedule_update,
-    state_of,
-    switched,
-    telling,
-)
+from fusion.app.parts import PathError, ReportHandler, State, column, note, schedule_update, state_of, switched, telling
 from fusion.app.runs import RUNS
 
 # Authentication: every request is checked here before any page, file or connection answers it.

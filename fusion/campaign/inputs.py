@@ -35,14 +35,7 @@ from fusion.campaign.config import (
     ThermographyTable,
     relative_name,
 )
-from fusion.campaign.logs import (
-    NO_START,
-    ContactSensors,
-    TableError,
-    read_drivers,
-    read_run,
-    read_sensors,
-)
+from fusion.campaign.logs import NO_START, ContactSensors, TableError, read_drivers, read_run, read_sensors
 from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
 from fusion.campaign.time_zones import DATED, bring_to_utc, refuse_mixed_zones, utc, zone_notices
 from fusion.campaign.values import in_order, matching_pipes, name_and_unit

@@ -25,12 +25,7 @@ from fusion.report.wording import (
 from fusion.results.axis import DriftPart, Iso230Part
 from fusion.results.loop import RecordLoop, StepPart
 from fusion.results.numbers import alike, print_unit
-from fusion.results.parts import (
-    Figures,
-    Quantity,
-    TimePart,
-    decide,
-)
+from fusion.results.parts import Figures, Quantity, TimePart, decide
 from fusion.results.results import Results
 
 

@@ -32,15 +32,7 @@ from fusion.report.charts.readings import cycle_map
 from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_series, new_figure, of_rank, palette
 from fusion.report.findings import action, next_steps, step_phrase
-from fusion.report.wording import (
-    Table,
-    anomaly_figures,
-    caption,
-    conditional,
-    effect_words,
-    iso230_values,
-    say,
-)
+from fusion.report.wording import Table, anomaly_figures, caption, conditional, effect_words, iso230_values, say
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import AxisLoop, RecordLoop
 from fusion.results.numbers import join, moment, number, p_words, place
