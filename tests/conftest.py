@@ -50,7 +50,7 @@ def pytest_collection_modifyitems(items):
     """Mark what reads the results of a whole run, starts the application or opens a browser."""
     for item in items:
         fixtures = set(getattr(item, "fixturenames", ()))
-        if fixtures & {"results_folder", "app", "states", "sound"}:
+        if fixtures & {"results_folder", "app", "states", "sound", "record_results"}:
             item.add_marker("chain")
         if fixtures & {"new_page", "opened"}:
             item.add_marker("browser")

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[1]
 FILES = [
     path for name in ("fusion", "interferometry", "thermofuse", "thermography") for path in (ROOT / name).rglob("*.py")

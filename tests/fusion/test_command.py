@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 #: Sends itself a signal while the first large library is being loaded.
 LOADING = """
 import os, sys

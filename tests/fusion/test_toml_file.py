@@ -49,6 +49,7 @@ def test_whatever_stands_in_it_is_one_fault_with_the_file(tmp_path: Path, text: 
     assert found.kind is Kind.UNKNOWN and reason in found.reason
 
 
+@pytest.mark.long
 def test_very_many_faults_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text("\n".join(f"a{number} = 1" for number in range(2_000)))

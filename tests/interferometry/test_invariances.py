@@ -13,6 +13,8 @@ from interferometry.drift.estimate import estimate_drift
 from interferometry.iso230.evaluation import evaluate_iso230
 from tests.interferometry.simulated_campaigns import recorded, simulate
 
+pytestmark = pytest.mark.long
+
 #: Of the joint estimate: the search for its variances ends at another last digit of its logarithms (reviewed: 2e-5 at most).
 SEARCH = 1e-4
 

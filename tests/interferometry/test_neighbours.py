@@ -14,6 +14,8 @@ from interferometry.neighbours import (
 )
 from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate
 
+pytestmark = pytest.mark.long
+
 
 def test_equations_4_and_6_to_the_letter(rng):
     deviations, _ = simulate(rng, cycles=12)

@@ -19,6 +19,8 @@ from fusion.campaign.inputs import read_record
 from fusion.common import FusionError
 from interferometry.common import InterferometryError
 
+pytestmark = pytest.mark.long
+
 #: 36 h from the evening of a day whose number and month differ, a row every ten minutes.
 _START = datetime(2026, 3, 9, 21, 40)
 _SECONDS = 600.0 * np.arange(217)

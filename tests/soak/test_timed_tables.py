@@ -14,6 +14,8 @@ import pytest
 from tests.soak.fuzz.timed_tables import kinds_of_timed_tables
 from tests.soak.test_damaged_inputs import KEPT, judged
 
+pytestmark = pytest.mark.long
+
 
 def test_some_tables_whose_times_are_text(tmp_path: Path) -> None:
     """The quick form."""

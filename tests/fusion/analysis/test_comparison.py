@@ -27,6 +27,8 @@ from fusion.results.store import file_sha256
 from tests.fusion.compared_tests import REPAIRED_MM, drift_of, readings_of, repaired, write_results
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def before(tmp_path_factory: pytest.TempPathFactory) -> Path:

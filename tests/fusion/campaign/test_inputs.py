@@ -33,6 +33,7 @@ from thermography.io.frame import CameraIdentity
 from thermography.radiometry.planck import calibrate
 
 
+@pytest.mark.long
 def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     frames = sorted((copied / "thermal").glob("*.jpg"))
     frames[3].write_bytes(frames[3].read_bytes()[:5000])
@@ -200,6 +201,7 @@ def stated(folder: Path, stack: str, *, camera: str = "") -> Path:
     return path
 
 
+@pytest.mark.long
 def test_the_frames_are_those_of_the_camera(campaign_folder: Path, stack_folder: Path) -> None:
     path = stated(stack_folder, 'unit = "degC"\ntimes = "times.csv"')
     source = read_source(load_campaign(path))

@@ -40,6 +40,8 @@ from tests.fusion.results_sample import AXIS_VALUES
 from tests.interferometry.iso230.made_tests import by_hand, test_made
 from tests.interferometry.simulated_campaigns import simulate
 
+pytestmark = pytest.mark.long
+
 X = np.random.default_rng(21).normal(0, 0.6, (5, 2, 7)) + np.array([[1.1], [-0.4]]) + 1.7 * np.arange(7.0)
 
 

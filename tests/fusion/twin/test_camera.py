@@ -10,6 +10,8 @@ from fusion.twin.camera import SC660, Renderer, air_transmission, counts_of, fid
 from fusion.twin.recipe import Camera, EffectRecipe, Recipe
 from fusion.twin.simulate import Truth, simulate
 
+pytestmark = pytest.mark.long
+
 QUIET = {"netd_K": 0.0, "blur_px": 0.0}
 BASE = Recipe().vary(test={"cycles": 12})
 

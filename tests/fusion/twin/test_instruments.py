@@ -19,6 +19,8 @@ from fusion.twin.recipe_file import read_recipe
 from interferometry.io.readings import read_deviations, read_environment
 from thermography.io.flir import index_frames, read_frame
 
+pytestmark = pytest.mark.long
+
 RECIPE = """
 [campaign]
 title = "Three cycles"

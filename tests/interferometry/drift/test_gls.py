@@ -374,6 +374,7 @@ def test_the_covariance_of_the_drift_holds_that_of_the_coefficients(rng):
     np.testing.assert_allclose(covariance, expected, rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("memory", [None, Memory(0.6, 9.0)])
 @pytest.mark.parametrize(("order", "ratios"), [(1, [0.05, 0.02]), (2, [1e-4, 1e-5])])
 def test_columns_that_few_readings_have_are_fitted_alike_by_their_own_recursion(

@@ -9,6 +9,8 @@ from thermography.fields import hotspots as module
 from thermography.fields.hotspots import common_part, detect_hotspots, region_series
 from thermography.registration.plan import PolygonError
 
+pytestmark = pytest.mark.long
+
 X = np.arange(140) * 5.0 + 2.5
 Y = np.arange(36) * 5.0 + 2.5
 

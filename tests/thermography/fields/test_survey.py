@@ -14,6 +14,8 @@ from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CalibratedRange, Frame
 from thermography.radiometry.planck import counts_from_temperature
 
+pytestmark = pytest.mark.long
+
 FRAMES = 8
 
 

@@ -11,6 +11,8 @@ from fusion.analysis.drift_model.record_data import RecordError, chained_blocks,
 from tests.fusion.record_tables import linear_samples, record_of, runs_table, table_of, twin_table
 from tests.soak.simulator import first_order
 
+pytestmark = pytest.mark.long
+
 
 def test_blocks_hold_the_means_of_their_samples(rng):
     displacement, temperature, speed = linear_samples(rng)

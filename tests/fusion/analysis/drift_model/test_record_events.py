@@ -11,6 +11,8 @@ from fusion.analysis.drift_model.record_events import Course, Event
 from fusion.analysis.drift_model.search import Reason
 from tests.fusion.record_tables import table_of
 
+pytestmark = pytest.mark.long
+
 SAMPLES, STEP_S = 1500, 60.0
 SECONDS = STEP_S * np.arange(SAMPLES)
 

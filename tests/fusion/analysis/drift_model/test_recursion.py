@@ -32,6 +32,8 @@ from fusion.results.recursion import FAILED, OK, SATURATED, Recursion, Recursion
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import record_of, runs_table, table_of, twin_table
 
+pytestmark = pytest.mark.long
+
 FROM = {"campaign": "twin", "results_sha256": "0" * 64}
 
 

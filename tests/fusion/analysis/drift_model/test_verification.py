@@ -13,6 +13,8 @@ from fusion.pipeline.record import record_variables
 from fusion.results.recursion import Recursion, RecursionError, run_recursion
 from tests.fusion.record_tables import table_of
 
+pytestmark = pytest.mark.long
+
 PER_K = np.array([[6.0, 1.0], [-3.0, 5.0], [1.0, 2.0]])
 
 

@@ -12,6 +12,8 @@ from fusion.report.exports.maps import CyclePictures
 from fusion.results.axis import HotspotPart
 from tests.fusion.report.exports.small_run import write_fields
 
+pytestmark = pytest.mark.long
+
 SPOT = HotspotPart(
     name="hotspot 1",
     x_mm=40.0,
