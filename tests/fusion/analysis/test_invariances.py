@@ -15,20 +15,14 @@ from tests.interferometry.simulated_campaigns import simulate
 
 pytestmark = pytest.mark.long
 
-#: Another way to store a positioning test.
-STORED = {
-    "targets in another order": lambda fused: fused.isel(
-        target=np.random.default_rng(1).permutation(fused.sizes["target"])
-    ),
-    "approaches in another order": lambda fused: fused.isel(direction=[1, 0]),
-    "cycles in another order": lambda fused: fused.isel(
-        cycle=np.random.default_rng(1).permutation(fused.sizes["cycle"])
-    ),
-}
+
+def stored(fused: xr.Dataset) -> xr.Dataset:
+    """A positioning test with its targets, approaches and cycles in another order."""
+    targets, cycles = (np.random.default_rng(1).permutation(fused.sizes[name]) for name in ("target", "cycle"))
+    return fused.isel(target=targets, direction=[1, 0], cycle=cycles)
 
 
-@pytest.mark.parametrize("stored", STORED.values(), ids=STORED)
-def test_the_model_of_an_axis_is_that_of_its_readings(stored):
+def test_the_model_of_an_axis_is_that_of_its_readings():
     fused, _ = simulate(np.random.default_rng(4), cycles=15)
     fused = fused.isel(target=slice(None, None, 3))
     fused["deviation"][3, 1, 2] = fused["deviation"][7] = np.nan
@@ -38,8 +32,7 @@ def test_the_model_of_an_axis_is_that_of_its_readings(stored):
     np.testing.assert_allclose(found.fit.residual(), plain.fit.residual(), atol=1e-3 * plain.fit.sigma)
 
 
-@pytest.mark.parametrize("stored", STORED.values(), ids=STORED)
-def test_the_map_of_sources_is_that_of_the_readings(stored):
+def test_the_map_of_sources_is_that_of_the_readings():
     made = simulator.driven_session(np.random.default_rng(2), source=0)
     field = made.field[:, ::4, ::4]
     plain, found = (correlate(one, field, draws=99, checks=1) for one in (made.fused, stored(made.fused)))
@@ -57,27 +50,12 @@ def samples() -> xr.Dataset:
     return table_of(displacement, temperature, step_s=300.0)
 
 
-RECORDED = {
-    "as it is": lambda table: (table, 1.0),
-    "columns in another order": lambda table: (table.isel(sensor=[1, 0], channel=[1, 0]), 1.0),
-    "displacements of the other sign": lambda table: (table.assign(displacement=-table["displacement"]), 1.0),
-    "nanometres for micrometres": lambda table: (table.assign(displacement=1000.0 * table["displacement"]), 1000.0),
-    "fifty years earlier": lambda table: (
-        table.assign_coords(time=table["time"].values - np.timedelta64(18262, "D")),
-        1.0,
-    ),
-}
-
-
-@pytest.fixture(scope="module")
-def closed():
-    return close_record(reduce_record(samples()), ["quasi_static"]).described(())
-
-
-@pytest.mark.parametrize("stored", RECORDED.values(), ids=RECORDED)
-def test_the_loop_of_a_record_finds_the_same(closed, stored):
-    table, factor = stored(samples())
-    found = close_record(reduce_record(table), ["quasi_static"]).described(())
+def test_the_loop_of_a_record_finds_the_same():
+    """Of the same columns in another order, with the other sign, in nanometres and fifty years earlier."""
+    table, factor = samples(), 1000.0
+    turned = table.assign(displacement=-factor * table["displacement"]).isel(sensor=[1, 0], channel=[1, 0])
+    earlier = turned.assign_coords(time=table["time"].values - np.timedelta64(18262, "D"))
+    closed, found = (close_record(reduce_record(one), ["quasi_static"]).described(()) for one in (table, earlier))
     assert [step.effect for step in found.steps] == [step.effect for step in closed.steps] == ["step_event"]
     (step,) = found.steps
     # One time for one event, within its block of 5 min: between the samples at 39 and at 40 times that.
