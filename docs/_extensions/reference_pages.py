@@ -25,6 +25,9 @@ from fusion.campaign.inspect import Kind
 from fusion.report.wording import environment
 from fusion.results.results import results_schema
 from fusion.twin.recipe_file import recipe_schema
+from interferometry.io.readings import FILES, TABLES
+from thermofuse.resources import vocabulary
+from thermography.io.other_cameras import plug_ins, readers
 
 PACKAGES = ("thermography", "interferometry", "fusion")
 
@@ -216,11 +219,50 @@ def command_page() -> str:
     return text.partition("\n")[2]
 
 
-def kinds_of_file() -> str:
-    """Return a table of the kinds of files that are recognised, with the key of the campaign file that names one."""
+def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [heads, ["---"] * len(heads), *([cell(text) for text in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def format_tables() -> dict[str, str]:
+    """Return the tables of `formats.md` by name: kinds, readers and layouts as they are declared, with what the vocabulary says of each."""
+    said = dict(vocabulary("formats"))
     kinds = [kind.value for kind in Kind if kind not in (Kind.UNKNOWN, Kind.UNREADABLE)]
-    rows = [f"| {kind.words} | {f'`{kind.key}`' if kind.key else ''} |" for kind in kinds]
-    return "\n".join(["| kind | key |", "|---|---|", *rows]) + "\n"
+    layouts = {
+        "frames": {one.name: said["frames"][one.name] for one in readers()[len(plug_ins()) :]},
+        "deviations": {one.name: said["deviations"][one.name] for one in (*FILES, *TABLES)},
+        "logged": said["logged"],
+    }
+    tables = {
+        name: table_of(
+            ("kind", "what is read", "asked", "tried on"),
+            [
+                (
+                    f"{kind} ({one['files']})" if "files" in one else kind,
+                    one["read"],
+                    one.get("asked", ""),
+                    one["tried"],
+                )
+                for kind, one in of_name.items()
+            ],
+        )
+        for name, of_name in layouts.items()
+    }
+    keys = [(one.words, f"`{one.key}`" if one.key else "", said["kinds"][one.words]) for one in kinds]
+    unread = {one["words"]: ", ".join(one.get("endings", ())) for one in vocabulary("frames")["unread"]}
+    pairs = {
+        "limits": ("file", "at most"),
+        "times": ("", "read"),
+        "readings": ("", "accepted"),
+        "not_read": ("file", "why, and what to do"),
+    }
+    said["not_read"] = said["not_read"] | {ends: words for words, ends in unread.items() if ends}
+    return (
+        tables
+        | {"kinds": table_of(("kind", "key", "told by"), keys)}
+        | {name: table_of(heads, [*said[name].items()]) for name, heads in pairs.items()}
+    )
 
 
 def checks_table() -> str:
@@ -301,7 +343,7 @@ def write_pages(app: Sphinx) -> None:
         generated / "command.md": command_page(),
         generated / "campaign.md": campaign_page(campaign_schema()),
         generated / "recipe.md": schema_page(recipe_schema()),
-        generated / "kinds.md": kinds_of_file(),
+        **{generated / f"formats_{name}.md": table for name, table in format_tables().items()},
         generated / "results.md": schema_page(results_schema()),
     }
     for path, text in pages.items():

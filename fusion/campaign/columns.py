@@ -4,35 +4,35 @@ from __future__ import annotations
 
 import json
 import re
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from pandas.tseries.api import guess_datetime_format
 
 from fusion.campaign.config import HeaderRows, LoggedTable
 from fusion.campaign.logs import (
     MONITORED,
+    PARTS,
     Rows,
     has_unit,
     numbers_in,
+    parts_of_time,
     read_rows,
     read_times,
     stripped,
     text_lines,
-    within_a_day,
+    unwrapped,
     written_times,
 )
 from fusion.campaign.values import (
     DAY_NUMBERS,
     TIME_UNITS,
     column_unit,
+    conversion,
     is_time,
     is_unit,
     name_and_unit,
@@ -45,7 +45,9 @@ from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormat
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
     DateOrder,
+    closest_orders,
     delimiter_of_values,
+    elapsed_s,
     fields_of,
     parse_time,
     read_heading,
@@ -85,20 +87,19 @@ _FACTOR = re.compile(r"[x×*·/]?\s*\d[\d.,eE^/+-]*\s*[x×*·]?|[x×*·]")
 _POWER_ON, _POWER_ON_JUMP = (85.0, 185.0), 5.0
 #: A mark lies this far outside the other values of its column.
 _FAR = 50.0
-#: Times that neither ISO 8601 nor the guess of pandas covers.
-_FORMATS = (
-    "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%I:%M:%S %p", "%I:%M %p",
-    "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%m/%d/%y-%H:%M:%S",
-    "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m/%d/%y %H:%M", "%m/%d/%Y %I:%M:%S %p", "%m/%d/%Y %I:%M %p",
-    "%d-%b-%y %H:%M:%S", "%d-%b-%y %H:%M", "%d-%b-%y %I:%M:%S %p", "%d-%b-%y %I:%M %p",
-)  # fmt: skip
-#: Day and month of a date whose year comes last; with dots between them the day stands first.
-_SWAPPED = re.compile(r"^%([md])([-/])%([md])")
-_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?([.,]\d+)?\s*([ap]\.?m\.?)?", re.I)
-#: Second of 1904-01-01 plus this many is in the years in which LabVIEW has written times, in seconds since 1970 in ours.
-_LABVIEW_S, _UNIX_S, _UNIX_MS = (3.2e9, 4.5e9), (1e9, 2.5e9), (1e12, 2.5e12)
-#: Shortest thermal test, by which a number without unit is told to be seconds or minutes.
-_SHORTEST_S = 1800.0
+#: Heading that states from when seconds count, that instant, and between which numbers of seconds the years of such times lie: GPS (less
+#: the leap seconds since 2017), Unix, LabVIEW.
+_EPOCHS = (
+    (re.compile(r"gps", re.I), "1980-01-05T23:59:42Z", 6e8, 2.5e9),
+    (re.compile(r"unix|epoch|posix", re.I), "1970-01-01T00:00:00Z", 1e9, 2.5e9),
+    (re.compile(r"labview|1904", re.I), "1904-01-01T00:00:00Z", 3.2e9, 4.5e9),
+)
+#: Later seconds of Unix would be GPS times after 2030.
+_UNIX_ALONE = (1.6e9, 2.5e9)
+#: Headings that say what the numbers of a time of day are.
+_MINUTES_FIRST, _HOURS_FIRST = re.compile(r"\bm+:s+\b", re.I), re.compile(r"\bh+:m+", re.I)
+#: Shortest and longest thermal test, by which a number without unit is told to be seconds, minutes or milliseconds.
+_LENGTHS_S = np.array([1800.0, 1e7])
 #: Words of headings, the plain ones before those of one or two letters.
 _WORDS = tuple((one["name"], frozenset(one["words"])) for one in _VOCABULARY["role"])
 #: Words of a column that counts, and of one that says nothing of what it holds, where no other word stands beside them.
@@ -148,8 +149,9 @@ class Column:
 class TableProposal:
     """A logged table: keys of ``[record]`` that say how it is laid out, and its columns; `asked` are keys that the file does not tell.
 
-    ``time`` holds the times of its rows in UTC and ``reference`` how they came to it, in words; ``attrs`` lists the lines that are left
-    out, and those at which the clock goes back, as the attributes of the record read from it.
+    ``time`` holds the times of its rows in UTC, none where nothing states their unit, and ``reference`` how they came to it, in words;
+    ``attrs`` lists the lines that are left out, and those at which the clock goes back, as the attributes of the record read from it;
+    ``refused`` says why its rows cannot be a record.
     """
 
     path: Path
@@ -160,6 +162,7 @@ class TableProposal:
     time: np.ndarray = field(default_factory=lambda: np.array([], "M8[ns]"), compare=False)
     reference: str = ""
     attrs: Mapping[str, str] = field(default_factory=dict)
+    refused: str = ""
 
     def of(self, role: str) -> tuple[Column, ...]:
         """Return the columns of a role."""
@@ -224,7 +227,7 @@ class TableProposal:
         kept = {
             key: value
             for key, value in self.keys.items()
-            if key not in ("time", "every", "time_unit", "time_format", "long")
+            if key not in ("time", "every", "time_unit", "time_format", "date_order", "start", "long")
         }
         if not times:
             return replace(self, columns=tuple(columns), keys=kept, asked={"every": ""})
@@ -232,7 +235,7 @@ class TableProposal:
         if times[0].unit:
             keys["time_unit"] = times[0].unit
         elif times[0].span:
-            _place_times(np.array([times[0].low, times[0].high]), keys, asked)
+            _place_times(times[0].heading, np.array([times[0].low, times[0].high]), "", keys, asked)
         return replace(self, columns=tuple(columns), keys=keys, asked=asked)
 
 
@@ -269,7 +272,9 @@ def propose_table(path: Path) -> TableProposal:
     else:
         times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
         columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
-        not_known = "time_unit" in asked and any(_stated_units(rows, name) for name in times)
+        # A spreadsheet counts times in days.
+        in_days = not head[0][1] and keys.get("time_unit") == "h"
+        not_known = "time_unit" in asked and (in_days or any(_stated_units(rows, name) for name in times))
         remark = UNIT_NOT_KNOWN if not_known else ""
         timed = (Column(name, "time", keys.get("time_unit", ""), _first(frame[name]), remark=remark) for name in times)
         columns = [*timed, *columns]
@@ -281,7 +286,7 @@ def propose_table(path: Path) -> TableProposal:
         ]
     if marks:
         rows = read_rows(path, sheet=sheet, header=header, missing=marks)
-    time, reference, lines = _read(path, rows, keys)
+    time, reference, lines, refused = _read(path, rows, keys)
     lost = {line.line for line in lines["left_out"]}
     used = [name for one in columns if one.role in ROLES[1:-1] for name in rows.marks.get(one.heading, ())]
     lines["marks"] = [mark for mark in used if mark.line not in lost]
@@ -291,28 +296,31 @@ def propose_table(path: Path) -> TableProposal:
         tuple(columns),
         len(frame) + len(rows.left_out) - len(lines["left_out"]),
         asked,
-        time,
+        time[:0] if "time_unit" in asked else time,
         reference,
         {name: json.dumps([asdict(line) for line in of_name]) for name, of_name in lines.items()},
+        refused,
     )
 
 
-def _read(path: Path, rows: Rows, keys: Mapping[str, Any]) -> tuple[np.ndarray, str, dict[str, list[RejectedLine]]]:
-    """Return the times of a table, how they came to UTC in words, and by the attribute that holds them the lines that a record leaves out,
-    and those at which its clock goes back.
+def _read(
+    path: Path, rows: Rows, keys: Mapping[str, Any]
+) -> tuple[np.ndarray, str, dict[str, list[RejectedLine]], str]:
+    """Return the times of a table, how they came to UTC in words, by the attribute that holds them the lines that a record leaves out, and
+    those at which its clock goes back, and why a record refuses them.
     """
     headings = keys["long"]["time"] if "long" in keys else keys.get("time")
     if headings is None:
-        return np.array([], "M8[ns]"), "", {"left_out": rows.left_out}
+        return np.array([], "M8[ns]"), "", {"left_out": rows.left_out}, ""
     layout = LoggedTable.model_validate({key: value for key, value in keys.items() if key not in ("long", "time")})
     time, reference, without = read_times(path, rows, layout, [headings] if isinstance(headings, str) else headings)
     keep = ~np.isnat(time)
-    back = [] if "long" in keys else where_clock_goes_back(path, rows.frame.index[keep], time[keep])
-    return (
-        time[keep],
-        reference,
-        {"left_out": sorted([*rows.left_out, *without], key=lambda line: line.line), "clock": back},
-    )
+    lines, refused = {"left_out": sorted([*rows.left_out, *without], key=lambda line: line.line)}, ""
+    try:
+        lines["clock"] = [] if "long" in keys else where_clock_goes_back(path, rows.frame.index[keep], time[keep])
+    except LaserFormatError as error:
+        refused = str(error).removeprefix(f"{path}, ")
+    return time[keep], reference, lines, refused
 
 
 def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple[list[Column], list[float]]:
@@ -477,6 +485,11 @@ def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str,
 def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str, ...]:
     """Return the headings of the times; write into `keys` how they are to be read, and into `asked` what nothing tells."""
     frame = rows.frame
+    parts = [str(name) for name in frame.columns if str(name).strip().casefold() in PARTS]
+    whole = parts_of_time(frame, parts)
+    if whole is not None and _mostly(whole.notna()):
+        keys["time"] = parts
+        return tuple(parts)
     samples = {name: _sample(frame[name]) for name in frame.columns if not pd.api.types.is_numeric_dtype(frame[name])}
     # A line of text among numbers, as a footer or a second header is, leaves a column one of numbers.
     texts = [
@@ -485,8 +498,8 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
         if not _mostly(np.isfinite(numbers_in(pd.Series(sample, dtype=object))))
     ]
     named = [name for name in frame.columns if _is_time_name(name, rows.units.get(name, ""))]
-    days = [name for name in named if name in texts and _mostly([_OF_DAY.fullmatch(text) for text in samples[name]])]
-    named = [*(name for name in named if name not in days), *days]
+    days = [name for name in texts if _mostly(np.isfinite(elapsed_s(samples[name])))]
+    named = [*(name for name in named if name not in days), *(name for name in named if name in days)]
     # A first column without a name that grows, and does not count rows, is the time.
     for name in [*named, *texts, *(["1"] if frame.columns[0] == "1" and not _counts(frame["1"]) else [])]:
         if name not in texts:
@@ -494,31 +507,41 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
                 continue
             keys["time"] = name
             stated = _stated_units(rows, name)
-            if not {*stated} & {*TIME_UNITS}:
-                _place_times(_finite(frame[name]), keys, asked)
-                if stated and "time_unit" in asked:
-                    asked["time_unit"] += f", in {stated[0]}: {UNIT_NOT_KNOWN}"
+            known = next((unit for unit in stated if unit in TIME_UNITS), "")
+            _place_times(name, _finite(frame[name]), known, keys, asked)
+            if stated and not known and "time_unit" in asked:
+                asked["time_unit"] += f", in {stated[0]}: {UNIT_NOT_KNOWN}"
             return (name,)
         for columns in ([name, *[two for two in days if two != name][:1]], [name]):
-            form = _clock(_sample(written_times(frame, columns)))
-            if form is not None:
-                asked |= {"time_format": form.pop("or")} if "or" in form else {}
-                keys |= {"time": columns if len(columns) > 1 else name} | form
+            written = _sample(written_times(frame, columns))
+            order = _order_of(written, asked)
+            if name in days and columns == [name]:
+                keys["time"], heading = name, f"{name} {rows.units.get(name, '')}"
+                two = all(text.count(":") == 1 for text in written) and not _HOURS_FIRST.search(heading)
+                # Less than 24 minutes would be no test.
+                if _MINUTES_FIRST.search(heading) or (two and max(elapsed_s(written)) >= 86400.0):
+                    keys["time_format"] = "%M:%S"
+                    asked |= {} if _MINUTES_FIRST.search(heading) else {"time_format": "%H:%M"}
+                return (name,)
+            if _mostly([_is_read(text, DateOrder(order)) for text in written]):
+                keys |= {"time": columns if len(columns) > 1 else name} | ({"date_order": order} if order else {})
                 return tuple(columns)
+            asked.pop("date_order", None)
     asked["every"] = ""
     return ()
 
 
 def _stated_units(rows: Rows, name: str) -> list[str]:
     """Return the units that the row of units and the heading state of a column."""
-    return [unit_name(unit) for unit in (rows.units.get(name, ""), column_unit(name)) if unit.strip("- ")]
+    alone = name.strip() if unit_name(name.strip()) in DAY_NUMBERS else ""
+    return [unit_name(unit) for unit in (rows.units.get(name, ""), column_unit(name), alone) if unit.strip("- ")]
 
 
 def _is_time_name(heading: str, unit: str) -> bool:
     """Whether a heading, or its unit in a row of units, is that of a time or a date."""
     name, in_heading = name_and_unit(heading)
     named = _TIME.match(name) is not None and role_of_unit(unit or in_heading) != "temperature"
-    return is_time(heading) or unit_name(unit) in TIME_UNITS or named
+    return is_time(heading) or named or not {unit_name(unit), unit_name(heading.strip())}.isdisjoint(TIME_UNITS)
 
 
 def _sample(column: pd.Series) -> list[str]:
@@ -528,9 +551,9 @@ def _sample(column: pd.Series) -> list[str]:
     return texts.iloc[:: max(1, len(texts) // 50)].tolist()
 
 
-def _mostly(each: Sequence[object]) -> bool:
+def _mostly(each: Iterable[object]) -> bool:
     """Whether something holds for more than half, as a reader asks of the lines of a file."""
-    return sum(map(bool, each)) > len(each) / 2
+    return bool(np.mean([bool(one) for one in each] or [False]) > 0.5)
 
 
 def _finite(column: pd.Series) -> np.ndarray:
@@ -539,7 +562,7 @@ def _finite(column: pd.Series) -> np.ndarray:
 
 
 def _grows(column: pd.Series) -> bool:
-    numbers = _finite(column)
+    numbers, _ = unwrapped(_finite(column))
     return numbers.size > 1 and bool(numbers[-1] > numbers[0]) and float((np.diff(numbers) >= 0).mean()) > 0.98
 
 
@@ -547,66 +570,51 @@ def _counts(column: pd.Series) -> bool:
     return bool((np.diff(_finite(column)) == 1.0).all())
 
 
-def _place_times(numbers: np.ndarray, keys: dict[str, Any], asked: dict[str, str]) -> None:
-    """Write the unit of times that are numbers without one into `keys`, and where they count from; into `asked` where nothing tells."""
-    for unit, (low, high), start in (
-        ("s", _LABVIEW_S, "1904-01-01T00:00:00Z"), ("s", _UNIX_S, "1970-01-01T00:00:00Z"), ("ms", _UNIX_MS, "1970-01-01T00:00:00Z"),
-    ):  # fmt: skip
-        if low < numbers[0] < high:
-            keys |= {"time_unit": unit, "start": start}
-            return
+def _place_times(heading: str, numbers: np.ndarray, known: str, keys: dict[str, Any], asked: dict[str, str]) -> None:
+    """Write the unit of times that are numbers into `keys`, and from when they count; into `asked` what nothing states."""
+    for unit in [known] if known else ("s", "ms", "us", "ns"):
+        seconds = numbers[0] * conversion(unit, "s")[0] if unit not in DAY_NUMBERS else 0.0
+        for stated, start, low, high in _EPOCHS:
+            if low < seconds < high and (stated.search(heading) or stated is not _EPOCHS[0][0]):
+                keys |= {"start": start} | ({} if known else {"time_unit": unit})
+                if not (stated.search(heading) or _UNIX_ALONE[0] < seconds < _UNIX_ALONE[1]):
+                    asked["start"] = " or ".join(other for _, other, *_ in _EPOCHS)
+                return
+    if known:
+        keys |= {"time_unit": known} if known in DAY_NUMBERS else {}
+        return
     for unit, of_1970 in DAY_NUMBERS.items():
         if _DAYS_FROM < numbers[0] - of_1970 < _DAYS_TO and not (numbers == np.round(numbers)).all():
             keys["time_unit"], asked["time_unit"] = unit, f"{numbers[0]:.6f} to {numbers[-1]:.6f}"
             return
-    length = float(numbers[-1] - numbers[0])
-    keys["time_unit"] = next((unit for unit, s in (("s", 1.0), ("min", 60.0)) if length * s >= _SHORTEST_S), "h")
+    whole, minutes, seconds = numbers == np.round(numbers), numbers // 100 % 100, numbers % 100
+    if whole.all() and 10_000 <= numbers.max() < 240_000 and 30 < minutes.max() < 60 > seconds.max():
+        # Seconds that are counted go through 6000 to 9999.
+        keys["time_format"], asked["time_format"] = "%H%M%S", ""
+        return
+    shortest, longest = _LENGTHS_S / (numbers[-1] - numbers[0])
+    units = (unit for unit in ("s", "min", "h", "ms", "us", "ns") if shortest <= conversion(unit, "s")[0] <= longest)
+    keys["time_unit"] = next(units, "h")
     asked["time_unit"] = f"{_plain(float(numbers[0]))} to {_plain(float(numbers[-1]))}"
 
 
-def _clock(texts: Sequence[str]) -> dict[str, str] | None:
-    """Return the key that says how times are written, and another way that fits as well; none where they are read without it; None where
-    most of the texts are no times.
-    """
+def _order_of(texts: Sequence[str], asked: dict[str, str]) -> str:
+    """Return what stands first in dates, where only their course tells it; write into `asked` what else may."""
     with suppress(LaserFormatError):
-        order = DateOrder.of(Path(), enumerate(texts))
-        if _mostly([_is_read(text, order) for text in texts]):
-            return {}
-    likely = [within_a_day(text)[0] for text in texts if re.search(r"\d[:_]?\d\d", text)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that the day stands first
-        shapes = {re.sub(r"\d", "0", text): text for text in likely}.values()
-        guessed = dict.fromkeys(form for form in map(guess_datetime_format, shapes) if form)
-    read: dict[str, list[datetime]] = {}
-    for form in dict.fromkeys((*guessed, *_FORMATS)):
-        # Day and month are told apart by the shorter test.
-        for written in (form, _SWAPPED.sub(r"%\3\2%\1", form)):
-            if not any(_formatted(text, written) for text in shapes):
-                continue
-            times = [time for text in likely if (time := _formatted(text, written)) is not None]
-            if len(times) > len(texts) / 2:
-                read[written] = times
-    most = max(map(len, read.values()), default=0)
-    spans = {form: max(times) - min(times) for form, times in read.items() if len(times) == most}
-    shortest = [form for form in spans if spans[form] == min(spans.values())]
-    return dict(zip(("time_format", "or"), shortest, strict=False)) if spans else None
+        DateOrder.of(Path(), enumerate(texts))
+        return ""
+    # A clock of AM and PM without blanks is an English one, as dates with the month first are.
+    usual = "month first" if re.search(r"\d ?[AP]M", texts[0]) else "day first"
+    first, *others = sorted(closest_orders(texts), key=usual.__ne__) or [""]
+    asked |= {"date_order": " or ".join(others)} if others else {}
+    return first
 
 
 def _is_read(text: str, order: DateOrder) -> bool:
-    """Whether a text is a time that needs no format."""
-    try:
-        parse_time(text, order)
-    except BadReading:
-        return False
-    return True
-
-
-def _formatted(text: str, form: str) -> datetime | None:
-    """Return the time that a text is in a format, None where it is none."""
-    try:
-        return datetime.strptime(text, form)
-    except ValueError:
-        return None
+    """Whether a text is a time."""
+    with suppress(BadReading):
+        return bool(parse_time(text, order))
+    return False
 
 
 # What a column holds, and its unit.

@@ -495,6 +495,9 @@ class StackTable(Table, title="Files of temperatures"):
     scale: float = key(1.0, "Temperature of one count", example="0.04", gt=0.0)
     offset: float = key(0.0, "Temperature of count 0")
     variable: str | None = key(None, "Variable of the file")
+    axes: Literal["frame, row, column", "row, column, frame"] | None = key(
+        None, "Order of the axes of a NumPy array", about="where its shape does not tell it"
+    )
     time_in_name: str | None = key(None, "Pattern of the time in the name", example="%Y%m%d_%H%M%S")
     times: ExistingFile | None = key(
         None, "File of the times of the frames", example="times.csv", about="its columns are file, frame, time"
@@ -814,10 +817,10 @@ class HeaderRows(Table, title="Lines of the table"):
         return self
 
 
-#: One heading, or two of a date and a time of day.
+#: One heading, two of a date and a time of day, or those of its parts, as Day, Hour and Minute.
 Headings = Annotated[
     tuple[str, ...],
-    Field(min_length=1, max_length=2),
+    Field(min_length=1, max_length=7),
     BeforeValidator(
         lambda value: (value,) if isinstance(value, str) else value, json_schema_input_type=str | tuple[str, ...]
     ),
@@ -844,7 +847,13 @@ class LoggedTable(Table):
         None, "Time from one row to the next", example="60 s", about="where the table has no times"
     )
     time_format: str | None = key(
-        None, "How the times are written (strptime)", example="%Y/%m/%d-%H:%M:%S", about="where they are not ISO 8601"
+        None,
+        "How the times are written (strptime)",
+        example="%Y/%m/%d-%H:%M:%S",
+        about="where they are not read without",
+    )
+    date_order: Literal["day first", "month first", "year first"] | None = key(
+        None, "What stands first in dates of numbers", about="where no date of the table tells it"
     )
     time_unit: TimeUnit | None = key(
         None, "Unit of times that are numbers", example="min", about=", ".join(TIME_UNITS), absent="that in the heading"

@@ -23,7 +23,7 @@ from fusion.results.store import is_text, write_text
 from interferometry.common import InterferometryError
 from interferometry.io.readings import NotStated
 from interferometry.io.tables import NO_ZONE
-from thermography.io.other_cameras import read_stack
+from thermography.io.other_cameras import AXES, StackError, read_stack
 from thermography.registration.plan import Fiducial
 
 # What the files of a folder cannot tell: asked at the terminal, or left as a marked line to be filled in.
@@ -289,7 +289,12 @@ def _thermography(content: FolderContent, asker: Asker, *, along_axis: bool) -> 
 def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator[str]:
     """Yield what files of temperatures do not hold themselves."""
     first = content.frame_files[0]
-    _, contents, values = read_stack(first)
+    try:
+        _, contents, values = read_stack(first)
+    except StackError:
+        # Of an array both orders of whose axes make pictures.
+        yield f'axes = "{TO_FILL}"   # {" or ".join(AXES)}'
+        _, contents, values = read_stack(first, AXES[0])
     known = {one.key: one for one in keys_of("thermography", "stack")}
     yield _line(known_keys()["thermography.camera_offset_u"])
     yield from [_line(known_keys()["thermography.table"])] if along_axis else []
@@ -307,7 +312,7 @@ def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterato
         else:
             yield f"{_line(known['start'], TO_FILL)}; or times, or time_in_name"
             yield from (_line(known[key]) for key in ("times", "time_in_name"))
-    if contents.frames > 1 and contents.times is None:
+    if contents.frames > 1 and contents.times is None and contents.elapsed is None:
         yield _line(known["interval"], asker.value(known["interval"]) or TO_FILL)
     yield from _lines(known.values(), {})
 
@@ -524,10 +529,10 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
             break
     keys = dict(table.keys)
     for key, shown in table.asked.items():
-        if key == "time_format":
+        if key in ("time_format", "date_order", "start"):
             written = " ".join(column.first[0] for column in table.of("time"))
-            question = f"Times such as {written} are written, %d the day and %m the month"
-            keys[key] = asker.choice(question, (keys[key], shown))
+            choices = (keys[key], *(one for one in shown.split(" or ") if one not in ("", keys[key])))
+            keys[key] = asker.choice(f"{known_keys()[f'record.{key}'].label}, such as {written}", choices)
         elif key == "time_unit" and table.of("time")[0].remark and not asker.ask:
             keys[key] = TO_FILL
         elif key == "time_unit":
@@ -549,7 +554,7 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
             for column in group
         }
         table = replace(table, columns=tuple(taken.get(column, column) for column in table.columns))
-    assumed = ["time_unit"] if "time_unit" in table.asked and keys["time_unit"] != TO_FILL else []
+    assumed = [key for key in table.asked if keys.get(key, TO_FILL) != TO_FILL and key != "every"]
     assumed += [
         column.heading
         for column in table.columns

@@ -85,7 +85,7 @@ def stack_options(campaign: Campaign) -> StackOptions:
     if table is None:
         return StackOptions(needs_time=needs_time)
     reflected = table.reflected_temperature_degC
-    same = ("scale", "offset", "variable", "time_in_name", "interval_s", "time_zone")
+    same = ("scale", "offset", "variable", "axes", "time_in_name", "interval_s", "time_zone")
     return StackOptions(
         **{name: getattr(table, name) for name in same},
         unit=table.unit or "",

@@ -13,6 +13,7 @@ from enum import Enum
 from errno import EINVAL, ENOENT
 from functools import cached_property
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -168,7 +169,7 @@ class Recognised:
         try:
             roles = {read_heading(name).role for name in self.first_line}
             of_a_laser = len(roles & {"cycle", "direction", "target", "position", "measured", "deviation"}) > 1
-            return None if of_a_laser else _read_record(self.path)
+            return None if of_a_laser else resolve_name("fusion.campaign.columns:propose_table")(self.path)
         except (FusionError, InterferometryError):
             return None
 
@@ -252,9 +253,7 @@ def _logs_drivers(found: Recognised) -> bool:
 
 
 def _logs_environment(found: Recognised) -> bool:
-    from interferometry.io.readings import is_environment_log
-
-    return is_environment_log(found.path)
+    return bool(resolve_name("interferometry.io.readings:is_environment_log")(found.path))
 
 
 def _holds_deviations(found: Recognised) -> bool:
@@ -269,12 +268,6 @@ def _holds_deviations(found: Recognised) -> bool:
     return True
 
 
-def _read_record(path: Path) -> TableProposal:
-    from fusion.campaign.columns import propose_table
-
-    return propose_table(path)
-
-
 def _read_names(path: Path) -> list[str]:
     from interferometry.io.tables import read_table
 
@@ -285,16 +278,9 @@ def _read_names(path: Path) -> list[str]:
     ]
 
 
-def _read_regions(path: Path) -> Any:
-    from fusion.analysis.attribution.modes import read_regions
-
-    return read_regions(path)
-
-
-def _read_lens(path: Path) -> Any:
-    from thermography.registration.projection import read_lens  # compiled: other files are described without it
-
-    return read_lens(path)
+def _later(name: str) -> Callable[[Path], Any]:
+    """Return a reader that is loaded when it is called: other files are described without what it needs."""
+    return lambda path: resolve_name(name)(path)
 
 
 def _describe_recipe(found: Recognised) -> list[str]:
@@ -362,11 +348,13 @@ def _describe_record(found: Recognised) -> list[str]:
     time = (
         f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else "without times"
     )
-    unit = table.keys.get("time_unit", "")
-    doubt = f" in {unit}, which nothing states" if "time_unit" in table.asked and unit else ""
-    lacks = [f"warning: {table.lacks}"] if table.lacks else []
+    doubts = [f"{key} = {table.keys[key]}" for key in table.asked if key in table.keys]
+    if "time_unit" in table.asked:
+        doubts = [f"times {table.asked['time_unit']}, in {table.keys['time_unit']}?"]
+    lacks = [f"warning: {fault}" for fault in (table.lacks, table.refused) if fault]
     return [
-        f"record, {sheet}{counted(table.rows, 'row')}, {time}{doubt}",
+        f"record, {sheet}{counted(table.rows, 'row')}, {time}",
+        *(f"{doubt}, which nothing states" for doubt in doubts),
         *_course(table.time, table.reference, "row"),
         *_columns(table),
         *lacks,
@@ -401,27 +389,20 @@ def _course(times: NDArray[np.datetime64], reference: str, noun: str) -> Iterato
         return
     length = duration(float((timed[-1] - timed[0]) / np.timedelta64(1, "s")))
     if timed[0] < DATED:
-        first, last = (
-            f"{float((time - np.datetime64(0, 's')) / np.timedelta64(1, 's')):.10g} s" for time in timed[[0, -1]]
-        )
+        first, last = (f"{time.astype('M8[ns]').astype(np.int64) / 1e9:.10g} s" for time in timed[[0, -1]])
         yield f"{first} to {last} after a start that is not stated, {length}"
     else:
         zone = "" if reference == NO_ZONE else None
         yield f"{moment(timed[0], zone)} to {moment(timed[-1], zone)}, {length}, {reference}"
     if timed.size > 1:
-        yield _rate(timed, noun)
-
-
-def _rate(timed: NDArray[np.datetime64], noun: str) -> str:
-    """Say how far apart sorted times are, and where there are gaps."""
-    gaps = [
-        f"{moment(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
-        for (_, end), (start, _) in itertools.pairwise(Recording("", timed).stretches())
-    ]
-    step_s = float(np.median(np.diff(timed).astype("m8[ns]").astype(np.int64))) * 1e-9
-    rate = f"{1 / step_s:.3g} {noun}s per second" if step_s > 0 else f"{noun}s of one time"
-    every = f"a {noun} every {duration(step_s)}" if step_s >= 1 else rate
-    return f"{every}, {counted(len(gaps), 'gap')}{': ' + listed(gaps) if gaps else ''}"
+        gaps = [
+            f"{moment(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
+            for (_, end), (start, _) in itertools.pairwise(Recording("", timed).stretches())
+        ]
+        step_s = float(np.median(np.diff(timed).astype("m8[ns]").astype(np.int64))) * 1e-9
+        rate = f"{1 / step_s:.3g} {noun}s per second" if step_s > 0 else f"{noun}s of one time"
+        every = f"a {noun} every {duration(step_s)}" if step_s >= 1 else rate
+        yield f"{every}, {counted(len(gaps), 'gap')}{': ' + listed(gaps) if gaps else ''}"
 
 
 def _describe_log(found: Recognised) -> list[str]:
@@ -480,15 +461,28 @@ class Kind(Enum):
         may_be=lambda found: _may_hold_a_frame(found),
         unused=", not mixed with the frames of a FLIR camera",
     )  # fmt: skip
-    LENS = FileKind("lens calibration", _is_lens, _read_lens, _describe_lens, "thermography.lens")
+    LENS = FileKind(
+        "lens calibration",
+        _is_lens,
+        _later("thermography.registration.projection:read_lens"),
+        _describe_lens,
+        "thermography.lens",
+    )
     FIDUCIALS = FileKind("fiducials", _lists_fiducials, read_fiducials, _describe_fiducials, "plan.fiducials")
     PLACES = FileKind(
         "places of contact sensors", _lists_sensors, _read_names, _describe_places, "sensors.places",
         unused=", for [sensors] together with [plan]: docs/reference/campaign-file.md",
     )  # fmt: skip
-    REGIONS = FileKind("regions of the plan", _lists_places, _read_regions, _describe_regions, "plan.regions")
+    REGIONS = FileKind(
+        "regions of the plan",
+        _lists_places,
+        _later("fusion.analysis.attribution.modes:read_regions"),
+        _describe_regions,
+        "plan.regions",
+    )
     RECORD = FileKind(
-        "record of temperatures and displacements", _names_a_record, _read_record, _describe_record, "record.file",
+        "record of temperatures and displacements", _names_a_record, _later("fusion.campaign.columns:propose_table"), _describe_record,
+        "record.file",
         may_be=lambda found: found.logged is not None and found.logged.may_be_record,
         unused="; the runs of one record have the same columns, another record is a campaign of its own",
     )  # fmt: skip
@@ -858,18 +852,12 @@ def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
 def _times(frames: Sequence[FrameReference]) -> Iterator[str]:
     """Say when the frames were taken, how far apart, and where there are gaps."""
     times = np.array([frame.time for frame in frames], dtype="datetime64[ns]")
-    timed = np.sort(times[~np.isnat(times)])
-    if timed.size == 0:
+    if np.isnat(times).all():
         yield "no times: the frames give no course over time"
         return
-    length_s = float((timed[-1] - timed[0]) / np.timedelta64(1, "s"))
     zones = sorted({frame.utc_offset_minutes or 0 for frame in frames})
     zone = join([f"{minutes / 60:+g} h" if minutes else "UTC" for minutes in zones])
-    if timed.size < 2:
-        yield f"{moment(timed[0])} (camera set to {zone})"
-        return
-    yield f"{moment(timed[0])} to {moment(timed[-1])}, {duration(length_s)} (camera set to {zone})"
-    yield _rate(timed, "frame")
+    yield from _course(times, f"camera set to {zone}", "frame")
 
 
 def _settings(frames: Sequence[FrameReference]) -> str:

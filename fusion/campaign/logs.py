@@ -10,11 +10,13 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from itertools import accumulate, chain, count
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
+from zoneinfo import available_timezones
 
 import numpy as np
 import pandas as pd
@@ -23,7 +25,7 @@ from pandas.io.parsers import TextParser  # type: ignore[attr-defined]
 
 from fusion.analysis.alignment.sensor_health import SensorFault, examine_readings, examine_sensors
 from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LoggedTable, LongTable, RecordTable
-from fusion.campaign.time_zones import bring_to_utc
+from fusion.campaign.time_zones import bring_to_utc, from_zone
 from fusion.campaign.values import (
     DAY_NUMBERS,
     TIME_UNITS,
@@ -35,6 +37,7 @@ from fusion.campaign.values import (
     unit_name,
 )
 from fusion.common import Array, FusionError
+from fusion.results.progress import counted
 from interferometry.io.faults import (
     SENTINEL_MAGNITUDE,
     THOUSANDS,
@@ -50,21 +53,23 @@ from interferometry.io.tables import (
     BadReading,
     DateOrder,
     DelimitedTable,
+    counted_on,
     decode_text,
     delimiter_of,
     delimiter_of_values,
     describe_time_zone,
+    elapsed_s,
     fields_of,
     find_header,
     parse_time,
-    raise_if_clock_restarts,
     raise_if_too_wide,
     read_table,
     read_timed_rows,
     shown,
     where_clock_goes_back,
+    zone_of,
 )
-from thermofuse.resources import vocabulary
+from thermofuse.resources import by_word, vocabulary
 from thermofuse.units import find_unit
 
 #: Warning of pandas about a line with more fields than the header.
@@ -79,11 +84,12 @@ _TAKEN = (
 _LONGEST_RECORD_S = 4.5e9
 #: A log in which no channel writes for so many of their usual intervals is interrupted: at random, 1 in 2**10.
 _LONGEST_SILENCE = 10.0
-#: Hours, minutes and seconds; of two numbers nothing tells whether they are minutes and seconds.
-_ELAPSED = re.compile(r"(\d{2,5})(:\d\d:\d\d\S*)")
-#: Zones by their short names, as +hhmm, and such a name in a heading, of UTC with hours and minutes.
-_ZONES: Mapping[str, str] = vocabulary("columns")["zones"]
-_IN_ZONE = re.compile(rf"(?<![^\W_])({'|'.join(_ZONES)})(?:\s*([+-]\d\d?)(?::?(\d\d))?)?(?![^\W_])")
+#: A zone by its place, in a heading.
+_PLACE = re.compile(r"[A-Z][a-z]+/[A-Z][\w+-]+(?:/[A-Z]\w+)?")
+#: Names of columns that hold a part of a time each -> the part.
+PARTS = by_word(vocabulary("columns")["parts"])
+#: Counters of loggers, in bits, and the largest step over which they are seen to begin again, in usual steps.
+_COUNTERS, _LARGEST_STEP = (16, 32), 2.0
 #: A heading in quotes that goes on in the next line, as Excel's Alt+Enter writes it, and the most lines of such headings.
 _OPEN_HEADING = re.compile(r'(?:^|[,;\t])\s*"[^"]*$')
 _LONGEST_HEADER = 20
@@ -277,8 +283,6 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         left_out += without_number
     keep = ~np.isnat(time)
     goes_back = [] if record.long is not None else where_clock_goes_back(path, frame.index[keep], time[keep])
-    if record.long is None:
-        raise_if_clock_restarts(path, frame.index[keep], time[keep])
     order = np.argsort(time[keep], kind="stable")
 
     def block(role: str, unit: str | None) -> tuple[list[str], list[str], np.ndarray]:
@@ -575,6 +579,10 @@ def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) 
         # As pandas numbers headings that are alike.
         names[next(one for one in chain([plain], (f"{plain}.{n}" for n in count(1))) if one not in names)] = None
     frame.columns = list(names)
+    for number in frame.select_dtypes("number"):
+        # 20260309063000 is no number.
+        if frame[number].between(19e12, 22e12).all():
+            frame[str(number)] = frame[number].map("{:.0f}".format)
     return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
 
 
@@ -746,40 +754,29 @@ def read_times(
     for heading in headings:
         _find(path, heading, frame)
     if record.every_s is not None:
-        return _after_start(np.arange(len(frame)) * record.every_s, record, path)
-    column = written_times(frame, headings)
-    seconds = numbers_in(column) if record.time_format is None else np.full(len(frame), np.nan)
-    zones: dict[str, int] = {}
-    if np.isfinite(seconds).sum() > 0.5 * len(frame):
-        unit = record.time_unit or rows.units.get(headings[0], "") or name_and_unit(headings[0])[1]
-        if not unit:
-            raise TableError(
-                f'{path}: the times in the column "{headings[0]}" are numbers without a unit; write time_unit = "s" (or '
-                f"{', '.join(unit for unit in TIME_UNITS if unit != 's')}) in the campaign file, where it names this one"
-            )
-        if unit in DAY_NUMBERS:
-            # To the millisecond: in a day since the year 0 a double resolves 0.01 ms.
-            milliseconds = np.round((seconds - DAY_NUMBERS[unit]) * 86_400e3)
-            time, words = _since(NO_START, milliseconds / 1e3), NO_ZONE
-        else:
-            elapsed = in_unit(seconds, unit, "s", column=headings[0], path=path)
-            time, words, _ = _after_start(elapsed, record, path)
-    elif record.time_format is not None:
-        time, zone = _formatted_times(path, column, record)
-        words = describe_time_zone(path, {zone: 0})
+        return *_after_start(np.arange(len(frame)) * record.every_s, record, path), []
+    texts = stripped(written_times(frame, headings))
+    parts = parts_of_time(frame, headings)
+    seconds = numbers_in(frame[headings[0]]) if len(headings) == 1 else np.full(len(frame), np.nan)
+    if record.time_format is not None:
+        time, words = _formatted_times(path, texts, record)
+    elif parts is not None:
+        time, words = parts.to_numpy("M8[ns]"), NO_ZONE
+    elif np.isfinite(seconds).mean() > 0.5:
+        time, words = _counted_times(path, seconds, rows, record, headings[0])
+    elif np.isfinite(elapsed := elapsed_s(texts)).mean() > 0.5:
+        time, words = _after_start(elapsed, record, path)
     else:
-        texts = ["" if pd.isna(value) else str(value) for value in column]
-        order = DateOrder.of(path, zip(column.index, texts, strict=True))
-        time = np.full(len(texts), np.datetime64("NaT", "ns"))
-        for at, text in enumerate(texts):
-            try:
+        lines = [(int(line), text) for line, text in zip(frame.index, texts, strict=True)]
+        order = DateOrder(record.date_order) if record.date_order else DateOrder.of(path, lines)
+        time, zones = np.full(len(texts), np.datetime64("NaT", "ns")), dict[str, int]()
+        for at, (line, text) in enumerate(lines):
+            with suppress(BadReading):
                 time[at], zone = parse_time(text, order)
-            except BadReading:
-                continue
-            zones.setdefault(zone, int(column.index[at]))
+                zones.setdefault(zone, line)
         words = describe_time_zone(path, zones) if zones else ""
-    if words == NO_ZONE and (zone := _zone_of(" ".join(headings))):
-        time, words = time - _offset(zone), f"{describe_time_zone(path, {zone: 0})}, as the heading says"
+    if words == NO_ZONE and (zone := _zone_in(" ".join(headings))):
+        time, words = from_zone(time, zone, file=path.name), f"converted to UTC from {zone}, as the heading says"
     same = np.flatnonzero(np.diff(time) == np.timedelta64(0)) + 1
     if same.tolist() == [len(time) - 1]:
         # What alone repeats a time, at the end, sums up the rows above it.
@@ -801,24 +798,54 @@ def read_times(
     return time, words, left_out
 
 
-def _zone_of(heading: str) -> str:
-    """Return the zone that a heading such as "Date Time, GMT+02:00" or "Time (CEST)" names, as +hhmm; empty where it names none.
-
-    >>> _zone_of("Date Time, GMT+2"), _zone_of("Timestamp [UTC]"), _zone_of("Time (CEST)"), _zone_of("Time (s)")
-    ('+0200', '+0000', '+0200', '')
-    """
-    if (match := _IN_ZONE.search(heading)) is None:
-        return ""
-    return f"{match[2][0]}{match[2][1:]:>02}{match[3] or '00'}" if match[2] else _ZONES[match[1]]
+def _zone_in(heading: str) -> str:
+    """Return the zone that a heading states, as UTC+02:00 or by its place; empty where it states none."""
+    place = next((name for name in _PLACE.findall(heading) if name in available_timezones()), "")
+    return f"UTC{zone[:3]}:{zone[3:]}" if (zone := zone_of(heading)) else place
 
 
-def _offset(zone: str) -> np.timedelta64:
-    """Return how far a zone such as +0530 is ahead of UTC."""
-    minutes = 60 * int(zone[1:3]) + int(zone[3:])
-    return np.timedelta64(-minutes if zone[0] == "-" else minutes, "m")
+def parts_of_time(frame: pd.DataFrame, headings: Sequence[str]) -> pd.Series | None:
+    """Return the times that columns such as Day, Hour and Minute, or Year to Second, make; None where they are no such parts."""
+    parts = {PARTS.get(heading.strip().casefold(), ""): pd.to_numeric(frame[heading], "coerce") for heading in headings}
+    if "" in parts or len(parts) < max(2, len(headings)):
+        return None
+    return pd.to_datetime(pd.DataFrame({"year": 1970, "month": 1, "day": 1} | parts), errors="coerce")
 
 
-def _after_start(elapsed: np.ndarray, record: LoggedTable, path: Path) -> tuple[np.ndarray, str, list[RejectedLine]]:
+def _counted_times(
+    path: Path, counts: np.ndarray, rows: Rows, record: LoggedTable, heading: str
+) -> tuple[np.ndarray, str]:
+    """Return times that are numbers, NaT where a row has none, and how they came to UTC."""
+    unit = record.time_unit or rows.units.get(heading, "") or name_and_unit(heading)[1]
+    if not unit:
+        raise TableError(
+            f'{path}: the times in the column "{heading}" are numbers without a unit; write time_unit = "s" (or '
+            f"{', '.join(unit for unit in TIME_UNITS if unit != 's')}) in the campaign file, where it names this one"
+        )
+    if unit in DAY_NUMBERS:
+        # To the millisecond: in a day since the year 0 a double resolves 0.01 ms.
+        return _since(NO_START, np.round((counts - DAY_NUMBERS[unit]) * 86_400e3) / 1e3), NO_ZONE
+    on, again = unwrapped(counts)
+    time, words = _after_start(in_unit(on, unit, "s", column=heading, path=path), record, path)
+    return time, words + again
+
+
+def unwrapped(counts: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return the numbers of a counter of 16 or 32 bits that begins again at 0 as if it counted on, and that it did in words."""
+    known = np.isfinite(counts)
+    for bits in _COUNTERS:
+        on = counted_on(counts, 2.0**bits)
+        steps = np.diff(on[known])
+        over = steps[steps != np.diff(counts[known])]
+        if over.size and steps.min() > 0.0 and over.max() <= _LARGEST_STEP * np.median(steps):
+            return (
+                on,
+                f"; its counter of {bits} bits begins again at 0 ({counted(over.size, 'time')}) and is counted on",
+            )
+    return counts, ""
+
+
+def _after_start(elapsed: np.ndarray, record: LoggedTable, path: Path) -> tuple[np.ndarray, str]:
     """Return the times that lie `elapsed` seconds after the start of a record, NaT where that is no number of a time."""
     start, zone = NO_START, "+0000"
     if record.start is not None:
@@ -826,7 +853,7 @@ def _after_start(elapsed: np.ndarray, record: LoggedTable, path: Path) -> tuple[
             start, zone = parse_time(record.start)  # type: ignore[assignment]
         except BadReading as fault:
             raise TableError(f'start = "{record.start}": {fault.reason}, needed for {path}') from None
-    return _since(start, elapsed), describe_time_zone(path, {zone: 0}), []
+    return _since(start, elapsed), describe_time_zone(path, {zone: 0})
 
 
 def _since(start: np.datetime64, elapsed: np.ndarray) -> np.ndarray:
@@ -837,34 +864,22 @@ def _since(start: np.datetime64, elapsed: np.ndarray) -> np.ndarray:
     return time
 
 
-def within_a_day(text: str) -> tuple[str, int]:
-    """Return an elapsed time such as 49:15:00 as a time of day, and the days before it; other texts as they are.
-
-    >>> within_a_day("49:15:00")
-    ('01:15:00', 2)
-    """
-    match = _ELAPSED.fullmatch(text)
-    if match is None:
-        return text, 0
-    days, hour = divmod(int(match[1]), 24)
-    return f"{hour:02d}{match[2]}", days
-
-
-def _formatted_times(path: Path, column: pd.Series, record: LoggedTable) -> tuple[np.ndarray, str]:
-    """Return the times of ``time_format``, NaT where a row has none, and their zone; times of day count from midnight of the first day."""
+def _formatted_times(path: Path, texts: pd.Series, record: LoggedTable) -> tuple[np.ndarray, str]:
+    """Return the times of ``time_format``, NaT where a row has none, and how they came to UTC; times of day from the first midnight."""
     form = str(record.time_format)
-    texts, days = zip(*map(within_a_day, stripped(column)), strict=True) if len(column) else ((), ())
+    if form == "%H%M%S":
+        texts = texts.str.removesuffix(".0").str.zfill(6)
     try:
-        times = pd.to_datetime(pd.Series(texts, column.index), format=form, errors="coerce", utc="%z" in form)
+        times = pd.to_datetime(texts, format=form, errors="coerce", utc="%z" in form)
     except ValueError as error:
         raise TableError(f'{path}: time_format = "{form}": {error}; for example "%Y/%m/%d-%H:%M:%S"') from None
     if not set(re.findall(r"%-?([a-zA-Z])", form)) & set("dDjcxs"):
-        # Hours that are counted beyond a day are elapsed; others begin again at midnight.
-        passed = np.array(days) if any(days) else (times.ffill().diff() < pd.Timedelta(-12, "h")).cumsum()
-        elapsed = ((times - times.dt.normalize()) + pd.to_timedelta(passed, unit="D")).dt.total_seconds()
-        return _after_start(elapsed.to_numpy(), record, path)[0], "+0000"
+        elapsed = elapsed_s(texts, of_minutes=form.startswith("%M"))
+        if np.isnan(elapsed).all():
+            elapsed = counted_on((times - times.dt.normalize()).dt.total_seconds().to_numpy("f8"), 86400.0)
+        return _after_start(elapsed, record, path)
     aware = times.dt.tz is not None
-    return times.dt.tz_localize(None).to_numpy("M8[ns]"), "+0000" if aware else ""
+    return times.dt.tz_localize(None).to_numpy("M8[ns]"), describe_time_zone(path, {"+0000" if aware else "": 0})
 
 
 def in_unit(values: np.ndarray, unit: str, target: str, *, column: str, path: Path) -> np.ndarray:

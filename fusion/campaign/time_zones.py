@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from zoneinfo import ZoneInfo
 
 import numpy as np
 import pandas as pd
@@ -26,21 +25,26 @@ def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str, late_s: floa
     time = table["time"]
     stamps = pd.DatetimeIndex(time.values.ravel())
     if zone is not None and lacks_zone(table):
-        placed = stamps.tz_localize(ZoneInfo(zone), ambiguous="NaT", nonexistent="NaT").tz_convert(None)
-        lost = np.flatnonzero(np.isnat(placed.values) & ~np.isnat(stamps.values))
-        if lost.size:
-            first = np.datetime_as_string(stamps.values[lost[0]], unit="s")
-            raise CampaignError(
-                f"{file}: {lost.size} times, the first {first}, occur twice or not at all in {zone}, where clocks are changed for summer; "
-                'export the times in UTC, and write time_zone = "UTC"'
-            )
         time = time.assign_attrs(reference=f"converted to UTC from {zone}")
-        stamps = placed
+        stamps = pd.DatetimeIndex(from_zone(stamps.values, zone, file=file))
     elif not late_s:
         return table
     utc = (stamps - pd.Timedelta(seconds=late_s)).values.astype("datetime64[ns]").reshape(time.shape)
     place = table.assign_coords if "time" in table.dims else table.assign
     return place(time=(time.dims, utc, time.attrs))
+
+
+def from_zone(stamps: NDArray[np.datetime64], zone: str, *, file: str) -> NDArray[np.datetime64]:
+    """Return times of a zone in UTC; refuse those that its clocks show twice or never."""
+    placed = pd.DatetimeIndex(stamps).tz_localize(zone, ambiguous="NaT", nonexistent="NaT").tz_convert(None)
+    lost = np.flatnonzero(np.isnat(placed.values) & ~np.isnat(stamps))
+    if lost.size:
+        first = np.datetime_as_string(stamps[lost[0]], unit="s")
+        raise CampaignError(
+            f"{file}: {lost.size} times, the first {first}, occur twice or not at all in {zone}, where clocks are changed for summer; "
+            'export the times in UTC, and write time_zone = "UTC"'
+        )
+    return placed.values.astype("M8[ns]")
 
 
 def lacks_zone(table: xr.Dataset) -> bool:

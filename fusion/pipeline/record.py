@@ -121,12 +121,13 @@ def _set_point_notices(health: SensorHealth) -> Iterator[Notice]:
 def guess_notices(campaign: Campaign) -> Iterator[Notice]:
     """Notice of the units that nobody stated and the values alone suggested."""
     if (record := campaign.record) is not None and record.guessed:
-        units = {"time_unit": record.time_unit} | {name: column.unit for name, column in record.columns.items()}
+        units = {key: getattr(record, key) for key in ("time_unit", "time_format", "date_order", "start")}
+        units |= {name: column.unit for name, column in record.columns.items()}
         named = listed(f"{name} = {units.get(name) or 'not stated'}" for name in record.guessed)
         yield Notice(
             "units_guessed",
             f"Assumed, because the table does not state it and its values suggest it: {named}. Another unit changes every time constant, "
-            "temperature or displacement by its factor.",
+            "temperature or displacement by its factor, another order or start the dates.",
             "Look it up at the logger, correct it where it is another, and remove it from record.guessed.",
         )
 

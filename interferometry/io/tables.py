@@ -9,12 +9,14 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -34,71 +36,108 @@ from thermofuse.units import SHARE, Unit, find_unit
 _VOCABULARY = vocabulary("headings")
 
 # Dates and times of a whole file: ISO 8601 and the usual other orders, refused where the file does not settle the
-# order.
+# order; times of day and elapsed times.
 
 #: Earlier times are no dates, but count from a start that is not stated.
 DATED = np.datetime64("1980-01-01", "ns")
 #: Attribute ``reference`` of times from a file that gives no zone.
 NO_ZONE = "no zone in the file: taken as UTC"
-#: Years of measurements; others are damage, and the first and last years of the calendar have no UTC.
 #: How PNG, JPEG, GIF and TIFF begin.
 _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*")
-_YEARS = (1950, 2199)
+#: Years of measurements, and from which programs count; others are damage, and the first and last years of the calendar have no UTC.
+_YEARS = (1900, 2199)
 
 _MONTHS = {name: month for month, names in enumerate(_VOCABULARY["months"], start=1) for name in names}
-_CLOCK = (
-    r"(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,](?P<fraction>\d{1,9}))?)?"
-    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?\s*(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2})?"
-)
+#: Zones by their short names, as +hhmm, and such a name in a heading, of UTC with hours and minutes.
+_ZONES: Mapping[str, str] = vocabulary("columns")["zones"]
+_NAMES_OF_ZONES = "|".join(_ZONES)
+_IN_ZONE = re.compile(rf"(?<![^\W_])({_NAMES_OF_ZONES})(?:\s*([+-]\d\d?)(?::?(\d\d))?)?(?![^\W_])")
+_ZONE = rf"(?P<zone>Z|(?:{_NAMES_OF_ZONES})?[+-]\d\d(?::?\d\d)?|{_NAMES_OF_ZONES})?"
+#: Behind the seconds; three digits behind a colon are milliseconds.
+_FRACTION = r"(?:(?:[.,]|:(?=\d{3}(?!\d)))(?P<fraction>\d{1,9}))?"
+_HALF = r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?)?"
+_CLOCK = rf"(?P<hour>\d{{1,2}}):(?P<minute>\d{{2}})(?::(?P<second>\d{{2}}){_FRACTION})?{_HALF}\s*{_ZONE}"
 _NUMERIC = re.compile(
-    rf"(?P<a>\d{{1,4}})\s*(?P<mark>[./-])\s*(?P<b>\d{{1,2}})\s*[./-]\s*(?P<c>\d{{1,4}})\.?[,T\s]+{_CLOCK}"
+    rf"(?P<a>\d{{4}}|\d{{1,2}})\s*(?P<mark>[./-])\s*(?P<b>\d{{1,2}})\s*[./-]\s*(?P<c>\d{{4}}|\d{{1,2}})\.?[,T\s-]+{_CLOCK}"
 )
-_NAMED = re.compile(rf"(?P<a>\d{{1,2}}|[^\W\d]+)[.\s-]+(?P<b>\d{{1,2}}|[^\W\d]+)[.,\s-]+(?P<c>\d{{4}})[,T\s]+{_CLOCK}")
+_NAMED = re.compile(
+    rf"(?P<a>\d{{1,2}}|[^\W\d]+)[.\s-]+(?P<b>\d{{1,2}}|[^\W\d]+)[.,\s-]+(?P<c>\d{{4}}|\d{{2}})[,T\s-]+{_CLOCK}"
+)
 _CHINESE = re.compile(rf"(?P<a>\d{{4}})年(?P<b>\d{{1,2}})月(?P<c>\d{{1,2}})日\s*{_CLOCK}")
+#: A time of day or an elapsed one, with days before it.
+_OF_DAY = (
+    r"^(?:(?P<days>\d{1,4})(?:[.:](?=\d\d:\d\d:\d\d)|\s*d(?:ays?)?,?\s*))?(?P<hour>\d{1,5}):(?P<minute>[0-5]\d)(?::(?P<second>[0-5]\d))?"
+    rf"{_FRACTION}{_HALF}$"
+)
+_COMPACT = re.compile(r"^(\d{8})(\d{6})$")
+#: Places of year, month and day in a date of numbers.
+_ORDERS = {"day first": (2, 1, 0), "month first": (2, 0, 1), "year first": (0, 1, 2)}
 
 
 @dataclass(frozen=True)
 class DateOrder:
-    """Whether the month stands before the day in the dates of a file; None where no date of the file settles it."""
+    """What stands first in the dates of a file, see `_ORDERS`; empty where no date settles it."""
 
-    month_first: bool | None = None
+    first: str = ""
 
     @classmethod
     def of(cls, path: Path, lines: Iterable[tuple[int, str]]) -> DateOrder:
         """Find the order from all dates of a file: one number beyond 12 decides."""
-        decided: dict[bool, tuple[int, str]] = {}
+        orders = dict.fromkeys(_ORDERS, (0, ""))
         open_question: tuple[int, str] | None = None
         for line, text in lines:
-            match = _NUMERIC.fullmatch(text.strip())
-            if match is None or len(match["a"]) > 2 or match["mark"] == ".":
-                continue
-            first, second = int(match["a"]), int(match["b"])
-            if first > 12 >= second:
-                decided.setdefault(False, (line, text))
-            elif second > 12 >= first:
-                decided.setdefault(True, (line, text))
-            elif first != second:
+            possible = possible_dates(text)
+            if len({*possible.values()}) > 1:
                 open_question = open_question or (line, text)
-        if len(decided) == 2:
-            (day_line, day), (month_line, month) = decided[False], decided[True]
-            raise LaserFormatError(
-                f"{path}: the date {day!r} on line {day_line} has the day first, {month!r} on line {month_line} the month; "
-                "write all dates as 2026-03-09"
-            )
-        if open_question is not None and not decided:
+            left = [order for order in orders if order in possible or not possible]
+            if not left:
+                (before, (first_line, first)), now = next(iter(orders.items())), next(iter(possible))
+                raise LaserFormatError(
+                    f"{path}: the date {first!r} on line {first_line} has the {before.split()[0]} first, {text!r} on line {line} the "
+                    f"{now.split()[0]}; write all dates as 2026-03-09"
+                )
+            orders = orders if len(left) == len(orders) else dict.fromkeys(left, (line, text))
+        if open_question is not None and len(orders) > 1:
             line, text = open_question
             raise LaserFormatError(
                 f"{path}, line {line}: {text!r} may have the day or the month first, and no date of the file resolves it; "
                 "write the dates as 2026-03-09"
             )
-        return cls(next(iter(decided), None))
+        return cls(next(iter(orders)) if len(orders) == 1 else "")
+
+
+def possible_dates(text: str) -> dict[str, date]:
+    """Return the dates that a text may mean, by the order of its numbers; none where the order is plain, as with dots or a year first."""
+    match = _NUMERIC.fullmatch(text.strip())
+    if match is None or len(match["a"]) == 4 or match["mark"] == ".":
+        return {}
+    numbers, found = (match["a"], match["b"], match["c"]), dict[str, date]()
+    for order, (year, month, day) in _ORDERS.items():
+        with suppress(ValueError):
+            found[order] = date(_year(numbers[year]), int(numbers[month]), int(numbers[day]))
+    return found
+
+
+def closest_orders(texts: Iterable[str]) -> list[str]:
+    """Return the orders in which the dates of a file are closest together; one alone where the test goes over a midnight."""
+    dates = list(filter(None, map(possible_dates, texts)))
+    possible = [order for order in _ORDERS if dates and all(order in each for each in dates)]
+    spans = {order: max(each[order] for each in dates) - min(each[order] for each in dates) for order in possible}
+    return [order for order, span in spans.items() if span == min(spans.values())]
+
+
+def _year(text: str) -> int:
+    """Return a year; one of two digits is one of 1969 to 2068, as POSIX has it."""
+    if len(text) not in (2, 4):
+        raise ValueError
+    return int(text) + (0 if len(text) == 4 else 1900 if int(text) > 68 else 2000)
 
 
 def parse_time(text: str, order: DateOrder | None = None) -> tuple[np.datetime64, str]:
     """Return a time in UTC (without a zone it is taken as UTC) and its zone as +hhmm, "" where the text has none; raises `BadReading`."""
     stripped = text.strip()
     try:
-        stamp = datetime.fromisoformat(stripped)
+        stamp = datetime.fromisoformat(_COMPACT.sub(r"\1T\2", stripped))
     except ValueError:
         stamp = _other_order(text, stripped, order or DateOrder())
     if not _YEARS[0] <= stamp.year <= _YEARS[1]:
@@ -113,42 +152,72 @@ def _other_order(text: str, stripped: str, order: DateOrder) -> datetime:
     wrong = BadReading(text, "is not an ISO 8601 time such as 2026-03-09T06:30:05+00:00")
     if match is None:
         raise wrong
-    year, month, day = _date(match, order, wrong, text)
-    hour = int(match["hour"])
+    day, hour = _date(match, order, wrong, text), int(match["hour"])
     if match["half"]:
         if not 1 <= hour <= 12:
             raise wrong
         hour = hour % 12 + (12 if match["half"][0] in "Pp" else 0)
     fraction = (match["fraction"] or "").ljust(6, "0")[:6]
-    clock = f"{hour:02d}:{match['minute']}:{match['second'] or '00'}.{fraction or '000000'}"
-    zone = {"Z": "+00:00", "UTC": "+00:00", "GMT": "+00:00", None: ""}.get(match["zone"], match["zone"])
+    zone = zone_of(match["zone"] or "") or (match["zone"] or "")
     try:
-        return datetime.fromisoformat(f"{year:04d}-{month:02d}-{day:02d}T{clock}{zone}")
+        return datetime.fromisoformat(f"{day}T{hour:02d}:{match['minute']}:{match['second'] or '00'}.{fraction}{zone}")
     except ValueError:
         raise wrong from None
 
 
-def _date(match: re.Match[str], order: DateOrder, wrong: BadReading, text: str) -> tuple[int, int, int]:
-    """Return year, month and day."""
+def _date(match: re.Match[str], order: DateOrder, wrong: BadReading, text: str) -> date:
+    """Return the date of a time."""
     a, b, c = match["a"], match["b"], match["c"]
-    named = next((name for name in (a, b) if not name.isdecimal()), None)
-    if named is not None:
-        month = _MONTHS.get(named.casefold())
-        day = b if named == a else a
-        if month is None or not day.isdecimal():
-            raise wrong
-        return int(c), month, int(day)
-    if len(a) == 4:
-        return int(a), int(b), int(c)
-    if match.re is _NAMED:
-        raise wrong
-    if len(c) != 4:
-        raise BadReading(text, "has a year of two digits; write it with four")
-    if match["mark"] == "." or int(a) == int(b):
-        return int(c), int(b), int(a)
-    if order.month_first is None:
+    possible = possible_dates(text) if match.re is _NUMERIC else {}
+    if len({*possible.values()}) > 1 and not order.first:
         raise BadReading(text, "may have the day or the month first; write the date as 2026-03-09")
-    return (int(c), int(a), int(b)) if order.month_first else (int(c), int(b), int(a))
+    try:
+        if match.re is _NAMED:
+            name, day = (b, a) if a.isdecimal() else (a, b)
+            return date(_year(c), _MONTHS[name.casefold()], int(day))
+        if len(a) == 4:
+            return date(int(a), int(b), int(c))
+        if match["mark"] == ".":
+            return date(_year(c), int(b), int(a))
+        return possible[order.first or next(iter(possible), "")]
+    except (KeyError, ValueError):
+        raise wrong from None
+
+
+def zone_of(text: str) -> str:
+    """Return the zone that a text such as "Date Time, GMT+02:00" or "Time (CEST)" names, as +hhmm; empty where it names none.
+
+    >>> zone_of("Date Time, GMT+2"), zone_of("Timestamp [UTC]"), zone_of("Time (CEST)"), zone_of("Time (s)")
+    ('+0200', '+0000', '+0200', '')
+    """
+    if (match := _IN_ZONE.search(text)) is None:
+        return ""
+    return f"{match[2][0]}{match[2][1:]:>02}{match[3] or '00'}" if match[2] else _ZONES[match[1]]
+
+
+def elapsed_s(texts: Iterable[str], *, of_minutes: bool = False) -> NDArray[np.floating]:
+    """Return times of day since the first midnight, or elapsed times, s, NaN for other texts; two numbers begin with hours, or minutes.
+
+    >>> elapsed_s(["49:15:00", "2.01:15:00"]), elapsed_s(["11:58 p. m.", "0:03", "-"]), elapsed_s(["59:30", "00:00.5"], of_minutes=True)
+    (array([177300., 177300.]), array([86280., 86580.,    nan]), array([3570. , 3600.5]))
+    """
+    parts = pd.Series(list(texts), dtype=object).str.strip().str.extract(_OF_DAY)
+    half, fraction = parts["half"].str[0].str.lower(), ("0." + parts["fraction"]).astype(float)
+    days, hour, minute, second = (parts[name].astype(float) for name in ("days", "hour", "minute", "second"))
+    hour = hour.where(half.isna(), hour % 12 + 12 * (half == "p"))
+    # Of hours nobody writes tenths.
+    if second.isna().all() and (of_minutes or fraction.notna().any()):
+        return counted_on((60 * hour + minute + fraction.fillna(0)).to_numpy(), 3600.0)
+    seconds = 86400 * days.fillna(0) + 3600 * hour + 60 * minute + second.fillna(0) + fraction.fillna(0)
+    return counted_on(seconds.to_numpy(), 86400.0)
+
+
+def counted_on(counts: NDArray[np.floating], period: float) -> NDArray[np.floating]:
+    """Return counts that begin again after a period, as a time of day at midnight does, as if they counted on; NaN stays."""
+    on, finite = counts.copy(), np.isfinite(counts)
+    if finite.any() and counts[finite].max() < period:
+        on[finite] += period * np.cumsum(np.diff(counts[finite], prepend=-np.inf) < -period / 2)
+    return on
 
 
 def describe_time_zone(path: Path, zones: dict[str, int]) -> str:
@@ -499,10 +568,24 @@ _MOST_STEPS_BACK = 1000
 
 
 def where_clock_goes_back(path: Path, lines: Sequence[int], times: NDArray[np.datetime64]) -> list[RejectedLine]:
-    """Return the lines whose time is before that of the line above, in a table with its newest line first after it."""
+    """Return the lines whose time is before that of the line above, in a table with its newest line first after it.
+
+    Raise a LaserFormatError where the clock goes back over several rows: sorted by their times, two stretches would be mixed.
+    """
     later = np.sign(np.diff(times).astype(np.int64))
-    against = np.flatnonzero(later * (1 if later.sum() >= 0 else -1) < 0)
-    word = "before" if later.sum() >= 0 else "after"
+    forwards = later.sum() >= 0
+    against = np.flatnonzero(later * (1 if forwards else -1) < 0)
+    for at in (against if forwards else against[::-1])[:_MOST_STEPS_BACK]:
+        parts = times[: at + 1], times[at + 1 :]
+        (before, after), (last, first) = (parts, (at, at + 1)) if forwards else (parts[::-1], (at + 1, at))
+        overlap = min(int((before > times[first]).sum()), int((after < times[last]).sum()))
+        if overlap > _OUT_OF_PLACE:
+            raise LaserFormatError(
+                f"{path}, line {lines[first]}: the clock goes back from {_written(times[last])} to {_written(times[first])}, over "
+                f"{overlap} rows; sorted by their times, two stretches would be mixed. Give the rows before and after as files of their "
+                "own, or correct their times; at the end of daylight saving write them with their offset from UTC, as 02:00:00+01:00"
+            )
+    word = "before" if forwards else "after"
     return [
         RejectedLine(
             path.name,
@@ -512,23 +595,6 @@ def where_clock_goes_back(path: Path, lines: Sequence[int], times: NDArray[np.da
         )
         for at in against
     ]
-
-
-def raise_if_clock_restarts(path: Path, lines: Sequence[int], times: NDArray[np.datetime64]) -> None:
-    """Refuse a table whose clock goes back over several rows: sorted by their times, two stretches would be mixed."""
-    later = np.sign(np.diff(times).astype(np.int64))
-    in_order = times if later.sum() >= 0 else times[::-1]
-    numbers = list(lines) if later.sum() >= 0 else list(lines)[::-1]
-    for at in np.flatnonzero(np.diff(in_order).astype(np.int64) < 0)[:_MOST_STEPS_BACK]:
-        before, after = in_order[: at + 1], in_order[at + 1 :]
-        overlap = min(int((before > after[0]).sum()), int((after < before[-1]).sum()))
-        if overlap > _OUT_OF_PLACE:
-            raise LaserFormatError(
-                f"{path}, line {numbers[at + 1]}: the clock goes back from {_written(before[-1])} to {_written(after[0])}, "
-                f"over {overlap} rows; "
-                "sorted by their times, two stretches would be mixed. Give the rows before and after as files of their own, or correct "
-                "their times; at the end of daylight saving write them with their offset from UTC, as 02:00:00+01:00"
-            )
 
 
 def _written(time: np.datetime64) -> str:
@@ -563,7 +629,6 @@ def read_timed_rows(
             zones.setdefault(zone, line)
     raise_if_mostly_invalid(table.path, len(rows), left_out.lines, last=max(kept.values(), default=None))
     instants = np.array(list(rows), dtype="datetime64[ns]")
-    raise_if_clock_restarts(table.path, [kept[instant] for instant in rows], instants)
     goes_back = where_clock_goes_back(table.path, [kept[instant] for instant in rows], instants)
     times = sorted(rows)
     values = np.array([rows[instant] for instant in times])

@@ -34,11 +34,11 @@ from thermography.io.fff_record import (
 from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame, Segments
 from thermography.io.region import Region, RegionKind
 from thermography.io.sequence import (
+    OPENING_THREADS,
     FlirFrameReference,
     FrameList,
     FrameTable,
     call_by_threads,
-    opening_threads,
     order_by_time,
 )
 
@@ -175,7 +175,7 @@ def index_files(
         return found
 
     files = list(map(Path, paths))
-    results = [each for some in call_by_threads(of_file, files, opening_threads(files)) for each in some]
+    results = [each for some in call_by_threads(of_file, files, OPENING_THREADS) for each in some]
     frames, repeated = order_by_time(each for each in results if not isinstance(each, RejectedFrame))
     return frames, [each for each in results if isinstance(each, RejectedFrame)] + repeated
 

@@ -85,6 +85,8 @@ class StackOptions:
         With which the camera's program calculated the temperatures; None: as the file says, 1 where it does not.
     reflected_temperature_K : float or None
         Likewise, K; 293.15 K where the file does not say it.
+    axes : {None, "frame, row, column", "row, column, frame"}
+        Of an array of three dimensions without names; None where its shape tells it.
     needs_time : bool
         Whether a file of one frame without a time is refused; a picture that stands alone needs none.
 
@@ -109,6 +111,7 @@ class StackOptions:
     time_zone: str = "UTC"
     emissivity: float | None = None
     reflected_temperature_K: float | None = None
+    axes: str | None = None
     needs_time: bool = True
 
     @property
@@ -133,6 +136,7 @@ class StackContents:
     ----------
     unit : "degC" or "K" where the file says it, else ""
     times : UTC or, without `zoned`, in the zone that `StackOptions` names; None where the file holds none
+    elapsed : times since a start that the file does not state, None where it holds none
     emissivity, reflected_temperature_K : with which the temperatures were calculated, where the file says it
     notes : what of the file was passed over
     """
@@ -141,6 +145,7 @@ class StackContents:
     shape: tuple[int, int]
     unit: str = ""
     times: tuple[np.datetime64, ...] | None = None
+    elapsed: NDArray[np.timedelta64] | None = None
     zoned: bool = False
     emissivity: float | None = None
     reflected_temperature_K: float | None = None
@@ -261,6 +266,8 @@ def _times(path: Path, contents: StackContents, options: StackOptions) -> list[n
     if options.time_in_name is not None:
         first = _time_in_name(path, options)
         return [first] if count == 1 else _spaced(path, first, count, options)
+    if options.start is not None and contents.elapsed is not None:
+        return list(options.start + contents.elapsed.astype("m8[ns]"))
     if options.start is not None:
         return [options.start] if count == 1 else _spaced(path, options.start, count, options)
     if contents.times is not None:
@@ -414,7 +421,7 @@ class NumpyReader(TemperatureReader):
     name = "NumPy array"
     starts = (b"\x93NUMPY",)
 
-    def _open(self, path: Path) -> NDArray[np.floating]:
+    def _open(self, path: Path, options: StackOptions) -> NDArray[np.floating]:
         # The header is text that NumPy parses as Python: a damaged one raises errors of many kinds.
         with _refused(f"{path}: damaged NumPy file", "save it again with numpy.save"):
             array = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -422,17 +429,36 @@ class NumpyReader(TemperatureReader):
             raise ThermographyError(
                 f"{path}: an array of shape {array.shape} and type {array.dtype}; save numbers as (row, column) or (frame, row, column)"
             )
-        return array if array.ndim == 3 else array[np.newaxis]
+        if array.ndim == 2:
+            return array[np.newaxis]
+        if not (axes := options.axes or axes_of(array.shape)):
+            raise StackError(
+                f"{path}: nothing says which axis of the shape {array.shape} counts the frames; write axes = {AXES[0]!r} or {AXES[1]!r}"
+            )
+        return array if axes == AXES[0] else np.moveaxis(array, -1, 0)
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a file holds."""
-        array = self._open(path)
+        array = self._open(path, options)
         _require_scale(path, array.dtype, options)
         return StackContents(array.shape[0], (array.shape[1], array.shape[2]))
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a frame, (row, column)."""
-        return np.array(self._open(path)[index])
+        return np.array(self._open(path, options)[index])
+
+
+#: Orders of the axes of an array without names.
+AXES = ("frame, row, column", "row, column, frame")
+
+
+def axes_of(shape: tuple[int, ...]) -> str:
+    """Return the order of three axes where only one of both makes pictures, or pictures of a common sensor; empty where both do."""
+    pictures = (shape[1:], shape[:2])
+    for fits in ([_has_proportions(*each) for each in pictures], [[*each] in _WORDS["sensors"] for each in pictures]):
+        if fits[0] != fits[1]:
+            return AXES[fits[1]]
+    return "" if _has_proportions(*shape[:2]) else AXES[0]
 
 
 class _Pictures(NamedTuple):
@@ -485,13 +511,13 @@ class NetcdfReader(TemperatureReader):
             # Each array of a store costs the library milliseconds whenever it is opened.
             if sum(entry.is_dir() for entry in store.iterdir()) > MOST_OBJECTS:
                 raise ValueError(f"it holds more than {MOST_OBJECTS} arrays and groups")
-            return {"/": xr.open_zarr(store, consolidated=False, chunks=None)}
+            return {"/": xr.open_zarr(store, consolidated=False, chunks=None, decode_timedelta=True)}
         with store.open("rb") as file:
             if file.read(3) == b"CDF":
-                return {"/": xr.open_dataset(store, engine="scipy")}
+                return {"/": xr.open_dataset(store, engine="scipy", decode_timedelta=True)}
         if fault := hdf5_fault(store):
             raise ValueError(fault)
-        return xr.open_groups(store, engine="h5netcdf", phony_dims="access")
+        return xr.open_groups(store, engine="h5netcdf", phony_dims="access", decode_timedelta=True)
 
     @contextmanager
     def _variable(self, path: Path, options: StackOptions) -> Iterator[_Pictures]:
@@ -527,12 +553,12 @@ class NetcdfReader(TemperatureReader):
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a store holds."""
         with self._variable(path, options) as (values, frame, row, column):
-            stamps = [
-                each.values.reshape(-1)
+            of_frames = {
+                each.dtype.kind: each.values.reshape(-1)
                 for each in values.coords.values()
-                if each.dtype.kind == "M" and each.dims == (() if frame is None else (frame,))
-            ]
-            times = tuple(stamps[0].astype("datetime64[ns]")) if stamps else None
+                if each.dims == (() if frame is None else (frame,))
+            }
+            times = tuple(of_frames["M"].astype("datetime64[ns]")) if "M" in of_frames else None
             stated = str(values.attrs.get("units", ""))
             if stated and stated not in _UNITS and not options.unit:
                 raise StackError(
@@ -540,7 +566,7 @@ class NetcdfReader(TemperatureReader):
                 )
             frames = 1 if frame is None else values.sizes[frame]
             shape = (values.sizes[row], values.sizes[column])
-            return StackContents(frames, shape, _UNITS.get(stated, ""), times, zoned=True)
+            return StackContents(frames, shape, _UNITS.get(stated, ""), times, zoned=True, elapsed=of_frames.get("m"))
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a time, (row, column)."""
@@ -636,6 +662,11 @@ _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _EMISSIVITY = re.compile(r"\bemissivity\W{1,4}([01][.,]?\d*)\b", re.IGNORECASE)
 _REFLECTED = re.compile(r"\brefl\w*\W+(?:\w+\W+)?temp\w*[^\w-]{1,4}(-?\d+(?:[.,]\d+)?)\W*([CFK])\b", re.IGNORECASE)
 _OWN_EXPORT = re.compile(r"surface temperature / degC; ([\dT:.-]+) UTC")
+#: A unit of the temperatures in a heading, as "Temperature [K]" or "TempUnit=°C", and the time that InfraTec's programs write there.
+_UNIT_ABOVE = re.compile(
+    r"^\W*(?:temp(?:erature?s?)?|temp ?unit|unit|einheit)\W{1,4}([CFK])\b", re.IGNORECASE | re.MULTILINE
+)
+_RECORDED = re.compile(r"RecDate=(\d\d)\.(\d\d)\.(\d{4})\s+RecTime=([\d:]{8})")
 #: A unit behind a number.
 _UNIT_BEHIND = re.compile(r"(?<=[\d.])[ \u00a0]?(?:[°º˚] ?)?([CFK])(?=[\"\s;,]|$)", re.MULTILINE)
 #: Frames joined without a line between them are higher than wide by more than that; no sensor is, whichever way it is turned.
@@ -685,12 +716,13 @@ class TextReader(TemperatureReader):
         frames, unit = _text_frames(path, *_state(path))
         head = _heading(path)
         own, emissivity, reflected = (pattern.search(head) for pattern in (_OWN_EXPORT, _EMISSIVITY, _REFLECTED))
+        time = own[1] if own else _RECORDED.sub(r"\3-\2-\1T\4", one[0]) if (one := _RECORDED.search(head)) else ""
         return StackContents(
             len(frames),
             (frames.shape[1], frames.shape[2]),
             unit="degC" if own else unit,
-            times=(np.datetime64(own[1], "ns"),) if own and len(frames) == 1 else None,
-            zoned=True,
+            times=(np.datetime64(time, "ns"),) if time and len(frames) == 1 else None,
+            zoned=own is not None,
             emissivity=float(emissivity[1].replace(",", ".")) if emissivity else None,
             reflected_temperature_K=_kelvin(*reflected.groups()) if reflected else None,
         )
@@ -712,6 +744,8 @@ def _text_frames(path: Path, size: int, changed_ns: int) -> tuple[NDArray[np.flo
     """Return the frames of a text, (frame, row, column), and the unit behind its numbers, "" where there is none."""
     content = _content(path)
     lines, unit = _plain_lines(content.decode("utf-16" if content[:2] in _UTF16 else "utf-8-sig", errors="replace"))
+    above = {one.upper() for one in _UNIT_ABOVE.findall(_heading(path))}
+    unit = unit or ("".join(above) if len(above) == 1 else "")
     for delimiter in _DELIMITERS if len(lines) <= _MOST_LINES else ():
         parts = [part for block in _blocks(lines, delimiter) for part in _parted(block, lines, delimiter)]
         longest = max(parts, key=lambda part: len(part.values), default=_Block(0, np.empty((0, 0)))).values
@@ -1019,13 +1053,13 @@ class Stack(NamedTuple):
     first: NDArray[np.floating]
 
 
-def read_stack(path: Path) -> Stack:
-    """Read what a file of temperatures holds, before anything is stated of it."""
+def read_stack(path: Path, axes: str | None = None) -> Stack:
+    """Read what a file of temperatures holds, before anything but the order of its axes is stated of it."""
     reader = find_reader(path)
     if not isinstance(reader, TemperatureReader):
         raise ThermographyError(f"{path}: not a known file of temperatures; docs/formats.md lists them")
     # A scale of one and an offset of nothing would be asked for; the values are shown as they are stored.
-    stored = StackOptions(scale=np.nextafter(1.0, 2.0))
+    stored = StackOptions(scale=np.nextafter(1.0, 2.0), axes=axes)
     return Stack(reader, reader.frame_contents(path, stored), reader.read_values(path, 0, stored))
 
 

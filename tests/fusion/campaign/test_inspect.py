@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import tifffile
 import xarray as xr
 
 from fusion.campaign.inspect import (
@@ -25,15 +26,18 @@ from fusion.campaign.inspect import (
 )
 from fusion.campaign.values import FILE_KEYS, column_unit, is_time
 from interferometry.io.faults import LaserFormatError
-from interferometry.io.readings import FILES, TABLES
+from interferometry.io.readings import FILES, TABLES, read_deviations
+from interferometry.io.writers import write_rtl
 from tests.thermography.flir_mutations import PARAMETERS, frame
+from tests.thermography.io.test_other_cameras import public_format
+from thermofuse.resources import vocabulary
 from thermography.common import ThermographyError
 from thermography.io import other_cameras as frame_readers
 from thermography.io.files import write_maps
 from thermography.io.flir import FlirReader
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CameraIdentity
-from thermography.io.other_cameras import StackContents, StackOptions, TemperatureReader
+from thermography.io.other_cameras import StackContents, StackOptions, TemperatureReader, find_reader, plug_ins, readers
 
 
 def test_a_folder_is_looked_into_and_its_series_summed_up(campaign_folder):
@@ -97,6 +101,11 @@ LASER = "cycle,direction,target,position_mm,time,deviation_um\n" + "".join(
     f"{c},{way},{t},{100 * t},{DAY}:{m:02d}:00Z,{t}.{c}\n"
     for m, (c, way, t) in enumerate((c, way, t) for c in (1, 2) for way in ("positive", "negative") for t in (1, 2))
 )
+ECMC_REPORT = "# ISO 230-2 motion test\n" + "".join(
+    f"### Data {way}ward direction\n\ni |tgt_pos(i) [mm]|ref_pos(i,1) [mm]|ref_pos(i,2) [mm]|\n--- |--- |--- |--- |\n"
+    "1|1.0|1.001|1.002|\n2|2.0|2.01|2.02|\n"
+    for way in ("for", "back")
+)
 LENS = '{"camera_matrix": [[900,0,320],[0,900,240],[0,0,1]], "distortion_coefficients": [0.1,0,0,0]}'
 LONG_TABLE = "".join(
     f"MILL:{name} 2026-03-09 06:{m:02d}:00.0 {m}.5\n" for m in range(9) for name in ("TEMP-1", "DISP-Z")
@@ -111,6 +120,16 @@ def write_map(path: Path) -> None:
     write_maps(path, {"temperature": np.full((2, 3), 20.5)}, units={"temperature": "degC"}, attributes={"cycle": 7})
 
 
+def write_netcdf(path: Path) -> None:
+    frames = xr.DataArray(np.full((8, 9, 2), 20.0), dims=("y", "x", "time"), name="t", attrs={"units": "degC"})
+    frames.to_netcdf(path)
+
+
+def write_linear_test(path: Path) -> None:
+    path.with_suffix(".csv").write_text(LASER)
+    write_rtl(path, read_deviations(path.with_suffix(".csv")))
+
+
 def write_flir(path: Path) -> None:
     write_sequence(path, [frame(6, 8, seconds=0)])
 
@@ -123,6 +142,9 @@ SAMPLES: list[tuple[Kind, str, str | Callable[[Path], object], list[str]]] = [
     (Kind.FRAMES, "a.seq", write_flir, ["FLIR, 1 frame of 8 x 6, samples raw"]),
     (Kind.STACK, "a.npy", lambda path: np.save(path, np.full((8, 9), 20.0)),
      ["NumPy array, 1 frame of 9 x 8", "  values of the first frame 20 to 20"]),
+    (Kind.STACK, "a.tif", lambda path: tifffile.imwrite(path, np.full((8, 9), 20.0, "f4")), ["TIFF of temperatures, 1 frame of 9 x 8"]),
+    (Kind.STACK, "a.fpf", lambda path: public_format(path, 2, np.full((8, 9), 20.0, "f4")), ["FLIR Public Format, 1 frame of 9 x 8"]),
+    (Kind.STACK, "a.nc", write_netcdf, ["NetCDF or Zarr, 2 frames of 9 x 8", "  values of the first frame 20 to 20 degC"]),
     (Kind.STACK, "a.csv", "\n".join(";".join(["20,1"] * 9) for _ in range(8)), ["text with one temperature per pixel, 1 frame of 9 x 8"]),
     (Kind.STACK, "a.txt", "\n".join("\t".join(["20.1"] * 32) for _ in range(32)), []),
     (Kind.PRODUCT, "a.exr", write_map, ["OpenEXR maps of 3 x 2 cells: cycle 7", "  temperature 20.5 to 20.5 °C"]),
@@ -150,6 +172,8 @@ SAMPLES: list[tuple[Kind, str, str | Callable[[Path], object], list[str]]] = [
      ["deviations, 1 cycle, 2 targets from 0 to 100 mm, 4 of 4 readings", "  deviation 0.100 to 0.400 µm"]),
     (Kind.DEVIATIONS, "a.dat", "UNIT=mm\nTGT_DATA[1]=0\nTGT_DATA[2]=1\n" + "".join(
         f"REF_DATA_{way}[{t},1]={t - 1}.001\n" for way in ("FWD", "BWD") for t in (1, 2)), []),
+    (Kind.DEVIATIONS, "a.rtl", write_linear_test, ["deviations, 2 cycles, 2 targets from 100 to 200 mm, 8 of 8 readings"]),
+    (Kind.DEVIATIONS, "a.md", ECMC_REPORT, []),
     (Kind.RECORD, "a.csv", "time [s],t1 [degC],ch1 [um],speed [1/min]\n0,20,0,1\n1,20,0,1\n",
      ["record, 2 rows, time in the column time [s]", "  0 s to 1 s after a start that is not stated, 1 s", "  a row every 1 s, 0 gaps",
       "  t1 [degC]: temperature, °C, by its heading, 20 to 20", "  ch1 [um]: displacement, µm, by its heading, 0 to 0",
@@ -157,8 +181,8 @@ SAMPLES: list[tuple[Kind, str, str | Callable[[Path], object], list[str]]] = [
     # A table of many columns with a time and names is no picture; what only the values tell is said.
     (Kind.RECORD, "a.csv", "Time," + ",".join(f"T{k}" for k in range(60)) + ",X\n" + "".join(
         f"{60 * k},{','.join(f'{20 + n / 10 + k / 100:.2f}' for n in range(60))},{k}.5\n" for k in range(60)),
-     ["record, 60 rows, time in the column Time in s, which nothing states", "  0 s to 3540 s after a start that is not stated, 59 min",
-      "  a row every 60 s, 0 gaps", "  T0 ... T59 (60 columns): temperature, °C, unit by its values, 20 to 26.49",
+     ["record, 60 rows, time in the column Time", "  times 0 to 3540, in s?, which nothing states",
+      "  T0 ... T59 (60 columns): temperature, °C, unit by its values, 20 to 26.49",
       "  X: displacement, µm, unit by its values, 0.5 to 59.5"]),
     *((Kind.RECORD, "a.csv", f"{time};Lager [°C];Z [µm]\n09.03.2026 06:30;20,5;0,25\n09.03.2026 06:31;20,6;0,35\n",
        [f"record, 2 rows, time in the column {time}"]) for time in ("Datum", "Zeit", "fecha y hora", "时间", "Date")),
@@ -223,9 +247,19 @@ def test_every_kind_has_a_sample_and_a_key_of_the_campaign_file():
     assert {kind.value.key for kind in named} <= keys and named == {kind for kind in Kind if kind.value.key}
 
 
-def test_every_layout_of_deviations_has_its_row_in_the_documentation():
-    rows = (Path(__file__).parents[3] / "docs/formats.md").read_text(encoding="utf-8")
-    assert all(f"\n| {one.name}" in rows for one in (*FILES, *TABLES))
+def test_every_row_of_the_page_on_formats_is_a_declaration_and_has_a_sample(tmp_path):
+    said, own = vocabulary("formats"), readers()[len(plug_ins()) :]
+    assert [*said["kinds"]] == [kind.value.words for kind in Kind if kind not in (Kind.UNKNOWN, Kind.UNREADABLE)]
+    assert {*said["frames"]} == {one.name for one in own} and [*said["deviations"]] == [
+        one.name for one in (*FILES, *TABLES)
+    ]
+    paths = {kind: [] for kind in Kind}
+    for k, (kind, name, content, _) in enumerate(SAMPLES):
+        (folder := tmp_path / str(k)).mkdir()
+        paths[kind].append(write_sample(folder, name, content))
+    assert {find_reader(path) for path in (*paths[Kind.FRAMES], *paths[Kind.STACK])} == {*own}
+    starts = [path.read_bytes() for path in paths[Kind.DEVIATIONS]]
+    assert all(any(one.find(start) for start in starts) for one in FILES)
 
 
 @pytest.mark.parametrize(("name", "content", "reason"), UNREAD)

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from tests.thermography.flir_mutations import HEADER, PARAMETERS, SETTINGS, TIME, fuzz, jpeg, patch, sequence
 from tests.thermography.flir_mutations import frame as simulate
 from thermography.common import ZERO_CELSIUS_K
-from thermography.io import sequence as by_threads
+from thermography.io import flir
 from thermography.io.flir import (
     FlirFrameReference,
     FrameReference,
@@ -303,7 +303,7 @@ def test_files_opened_by_threads_give_the_same_frames_and_faults(tmp_path, monke
         paths[number].write_bytes(paths[number].read_bytes()[: 100 * number])
     paths.insert(30, tmp_path / "not there.jpg")
     alone = index(paths)
-    monkeypatch.setattr(by_threads, "in_memory", lambda path: False)
+    monkeypatch.setattr(flir, "OPENING_THREADS", 1)
     together = index(paths)
     assert list(together[0]) == list(alone[0]) and together[1] == alone[1]
     assert len(alone[0]) + len(alone[1]) == 61 and len(alone[1]) > 4

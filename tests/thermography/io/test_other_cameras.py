@@ -16,7 +16,6 @@ import xarray as xr
 from tests.thermography.flir_mutations import sequence
 from tests.thermography.plan_scene import SC660
 from thermography.common import ThermographyError
-from thermography.io import flir
 from thermography.io import other_cameras as frame_readers
 from thermography.io.flir import FlirReader, read_frame
 from thermography.io.flir_writer import write_jpeg
@@ -378,7 +377,6 @@ def test_plug_ins_are_loaded_once_before_the_threads(tmp_path, plug_in):
 
     named(plug_in, "ReaderOfOnes")
     plug_in.setattr(importlib.metadata.EntryPoint, "load", load)
-    plug_in.setattr(flir, "opening_threads", lambda files: 8)
     paths = [tmp_path / f"{number}.one" for number in range(8)]
     for path in paths:
         path.write_bytes(b"ONES")

@@ -17,7 +17,7 @@ from thermography.io import sequence as module
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CameraIdentity
-from thermography.io.sequence import FrameTable, WindowReader, call_by_threads, frame_times, in_memory, order_by_time
+from thermography.io.sequence import FrameTable, WindowReader, call_by_threads, frame_times, order_by_time
 
 pytestmark = pytest.mark.long
 
@@ -127,16 +127,6 @@ def test_systems_without_affinity_are_asked_for_their_cores(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: None)
     assert module.usable_threads() == 1
-
-
-def test_files_are_opened_by_threads_only_where_the_disk_is_awaited(tmp_path, monkeypatch):
-    paths = [tmp_path / name for name in "ab"]
-    for path in paths:
-        path.write_bytes(b"a")
-    assert module.opening_threads(paths) == 1
-    monkeypatch.setattr(module, "in_memory", lambda path: False)
-    assert module.opening_threads(paths) == 8
-    assert module.opening_threads(paths[:1]) == module.opening_threads([]) == 1
 
 
 ENCODINGS = ("raw", "png", "jpegls")
@@ -462,26 +452,9 @@ def test_window_is_the_same_from_memory_and_from_the_disk(tmp_path, window, enco
                 assert (reader.read(part, buffer[:5]) == expected[start : start + 5]).all()
 
 
-def test_file_that_is_not_in_memory_is_read_past_the_cache(tmp_path):
-    references, _ = film(tmp_path / "a.seq")
-    forget(references[0].path)
-    with WindowReader(WINDOW) as reader:
-        reader.read(references, np.empty((12, 164, 320), np.uint16))
-        if reader._file.direct is None:
-            pytest.skip("this file system has no direct reading")
-        assert not reader._file.in_memory
-        references[0].path.read_bytes()
-        # What another program has read since is taken from memory.
-        reader.read(references[3:], np.empty((9, 164, 320), np.uint16))
-        assert reader._file.in_memory
-
-
-def test_frames_of_several_files_and_a_system_without_direct_reading(tmp_path, monkeypatch):
+def test_frames_of_several_files(tmp_path):
     first_film, first = film(tmp_path / "a.seq")
     second_film, second = film(tmp_path / "b.seq")
-    monkeypatch.delattr(os, "O_DIRECT", raising=False)
-    for path in (first_film[0].path, second_film[0].path):
-        forget(path)
     frames = [first_film[2], second_film[3], second_film[4], first_film[5]]
     with WindowReader(WINDOW) as reader:
         counts = reader.read(frames, np.empty((4, 164, 320), np.uint16))
@@ -502,7 +475,7 @@ def test_file_that_became_shorter_is_named(tmp_path, length):
 
 @pytest.mark.parametrize("encoding", ["raw", "png"])
 @pytest.mark.parametrize("size", [1, 5, 12, 40])
-def test_chunks_read_ahead_are_those_read_one_by_one(tmp_path, encoding, size):
+def test_chunks_are_those_read_one_by_one(tmp_path, encoding, size):
     references, counts = film(tmp_path / "a.seq", encoding=encoding)
     other, other_counts = film(tmp_path / "b.seq", encoding=encoding)
     frames, expected = [*references, *other[4:]], np.concatenate([counts, other_counts[4:]])[(slice(None), *WINDOW)]
@@ -513,45 +486,6 @@ def test_chunks_read_ahead_are_those_read_one_by_one(tmp_path, encoding, size):
             chunks = [chunk.copy() for chunk in reader.read_in_chunks(frames, size)]
         assert [len(chunk) for chunk in chunks[:-1]] == [size] * (len(chunks) - 1)
         assert (np.concatenate(chunks) == expected).all()
-
-
-def test_an_error_ends_the_reading_ahead(tmp_path):
-    references, _ = film(tmp_path / "a.seq")
-    forget(references[0].path)
-    with pytest.raises(ZeroDivisionError), WindowReader(WINDOW) as reader:
-        for _ in reader.read_in_chunks(references, 2):
-            raise ZeroDivisionError
-    os.truncate(references[0].path, 700_000)
-    forget(references[0].path)
-    with pytest.raises(OSError, match="ends early"), WindowReader(WINDOW) as reader:
-        list(reader.read_in_chunks(references, 2))
-
-
-def test_a_file_system_that_cannot_map_files_is_read_through_its_cache(tmp_path, monkeypatch):
-    references, counts = film(tmp_path / "a.seq")
-    forget(references[0].path)
-    original = module.mmap.mmap
-
-    def refuse(descriptor, *arguments, **options):
-        if descriptor >= 0:
-            raise OSError(19, "No such device")
-        return original(descriptor, *arguments, **options)
-
-    monkeypatch.setattr(module.mmap, "mmap", refuse)
-    with WindowReader(WINDOW) as reader:
-        assert (reader.read(references, np.empty((12, 164, 320), np.uint16)) == counts[:, 37:201]).all()
-    assert in_memory(references[0].path)
-
-
-def test_whether_a_file_is_in_memory(tmp_path):
-    path = tmp_path / "a.bin"
-    path.write_bytes(bytes(1 << 16))
-    assert in_memory(path)
-    forget(path)
-    assert not in_memory(path) or not hasattr(os, "posix_fadvise")
-    empty = tmp_path / "empty"
-    empty.write_bytes(b"")
-    assert in_memory(empty) and in_memory(tmp_path / "not there") and in_memory(tmp_path)
 
 
 def test_a_frame_whose_header_differs_from_its_checksum_is_left_out_of_a_long_sequence(tmp_path, monkeypatch):
