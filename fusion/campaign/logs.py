@@ -582,7 +582,7 @@ def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) 
     for number in frame.select_dtypes("number"):
         # 20260309063000 is no number.
         if frame[number].between(19e12, 22e12).all():
-            frame[str(number)] = frame[number].map("{:.0f}".format)
+            frame[str(number)] = frame[number].map("{:.0f}".format).str.replace(r"^(\d{8})", r"\1T", regex=True)
     return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
 
 

@@ -69,7 +69,6 @@ _OF_DAY = (
     r"^(?:(?P<days>\d{1,4})(?:[.:](?=\d\d:\d\d:\d\d)|\s*d(?:ays?)?,?\s*))?(?P<hour>\d{1,5}):(?P<minute>[0-5]\d)(?::(?P<second>[0-5]\d))?"
     rf"{_FRACTION}{_HALF}$"
 )
-_COMPACT = re.compile(r"^(\d{8})(\d{6})$")
 #: Places of year, month and day in a date of numbers.
 _ORDERS = {"day first": (2, 1, 0), "month first": (2, 0, 1), "year first": (0, 1, 2)}
 
@@ -137,7 +136,7 @@ def parse_time(text: str, order: DateOrder | None = None) -> tuple[np.datetime64
     """Return a time in UTC (without a zone it is taken as UTC) and its zone as +hhmm, "" where the text has none; raises `BadReading`."""
     stripped = text.strip()
     try:
-        stamp = datetime.fromisoformat(_COMPACT.sub(r"\1T\2", stripped))
+        stamp = datetime.fromisoformat(stripped)
     except ValueError:
         stamp = _other_order(text, stripped, order or DateOrder())
     if not _YEARS[0] <= stamp.year <= _YEARS[1]:

@@ -152,7 +152,70 @@ def write_table(folder: Path, clock: str, unit: str, layout: str, locale: str) -
     return folder / "log.txt"
 
 
-def judged(folder: Path) -> str:
+#: Clocks of one column each: heading, text of an instant and of the seconds since the first; {} stands for day and month.
+_GPS, _1904, _1970 = datetime(1980, 1, 5, 23, 59, 42), datetime(1904, 1, 1), datetime(1970, 1, 1)
+
+
+def _since(epoch: datetime, factor: float = 1.0) -> Callable[[datetime, float], str]:
+    return lambda at, s: f"{(at - epoch).total_seconds() * factor:.0f}"
+
+
+SPELLINGS: dict[str, tuple[str, str | Callable[[datetime, float], str]]] = {
+    "slashes": ("Time", "{}/%Y %H:%M:%S"),
+    "years of two digits": ("Time", "{}/%y %H:%M"),
+    "AM and PM": ("Time", "{}/%Y %I:%M:%S %p"),
+    "a. m. and p. m.": ("Fecha y hora", lambda at, s: "{}/%Y %I:%M:%S " + ("a. m." if at.hour < 12 else "p. m.")),
+    "milliseconds behind a colon": ("Time", "{}/%Y %H:%M:%S:000"),
+    "date and time": ("Date;Time", "{}/%Y;%H:%M:%S"),
+    "EST": ("Time", "%Y-%m-%d %H:%M:%S EST"),
+    "place in the heading": ("Date Time: Europe/Berlin", "%Y-%m-%d %H:%M:%S"),
+    "no marks": ("Time", "%Y%m%d%H%M%S"),
+    "parts": ("Year;Month;Day;Hour;Minute;Second", "%Y;%m;%d;%H;%M;%S"),
+    "day, hour, minute": ("Day;Hour;Minute", "%d;%H;%M"),
+    "Unix s": ("Timestamp", _since(_1970)),
+    "Unix us": ("Timestamp", _since(_1970, 1e6)),
+    "Unix ns": ("Timestamp", _since(_1970, 1e9)),
+    "GPS s": ("GPS time (s)", _since(_GPS)),
+    "LabVIEW s": ("Timestamp", _since(_1904)),
+    "MJD": ("MJD", lambda at, s: f"{(at - datetime(1858, 11, 17)) / timedelta(days=1):.7f}"),
+    "days and hours": ("Elapsed", lambda at, s: f"{int(s // 86400)}.{_elapsed(s % 86400):0>8}"),
+    "minutes and seconds": ("Elapsed", lambda at, s: f"{int(s // 60):02d}:{int(s % 60):02d}"),
+    "mm:ss": ("Time [mm:ss]", lambda at, s: f"{int(s // 60):02d}:{int(s % 60):02d}"),
+    "HHMMSS": ("Time", lambda at, s: f"{int(at.strftime('%H%M%S'))}"),
+    "centiminutes": ("Time [1/100 min]", lambda at, s: f"{s / 0.6:.0f}"),
+    "counter of 32 bits": ("Time [ms]", lambda at, s: f"{(4291967296 + int(1000 * s)) % 4294967296}"),
+    "12 hours without AM": ("Time", "%I:%M:%S"),
+    "end of daylight saving": ("Time", lambda at, s: f"{at - timedelta(hours=s > 7200):%Y-%m-%d %H:%M:%S}"),
+}  # fmt: skip
+#: Spellings whose dates have no meaning of their own.
+_UNDATED = (
+    "day, hour, minute", "days and hours", "minutes and seconds", "mm:ss", "HHMMSS", "centiminutes", "counter of 32 bits",
+    "12 hours without AM",
+)  # fmt: skip
+_AHEAD_H = {"EST": -5, "place in the heading": 1}
+#: First number of a date, and whether the test goes over a midnight.
+DATES = tuple(itertools.product(("%d/%m", "%m/%d"), (True, False)))
+
+
+def judged_spelling(folder: Path, spelling: str, order: str, over_midnight: bool) -> str:
+    """Say what the command makes of a table in one spelling."""
+    heading, written = SPELLINGS[spelling]
+    start = datetime(2026, 3, 9, 21 if over_midnight else 9, 40)
+    seconds = _SECONDS if over_midnight else _SECONDS[:61]
+    lines = [";".join([heading, "T bed [degC]", "T2 (air) [degC]", "X pos [um]"])]
+    for k, s in enumerate(seconds.tolist()):
+        at = start + timedelta(seconds=s)
+        text = (
+            written(at, s) if callable(written) else at.strftime(written.format(order) if "{" in written else written)
+        )
+        text = at.strftime(text.replace("{}", order)) if "{}" in text else text
+        lines.append(";".join([text, *(f"{truth[k]:.6f}" for truth in _TRUTH.values())]))
+    (folder / "log.txt").write_text("\n".join(lines) + "\n")
+    first = None if spelling in _UNDATED else start - timedelta(hours=_AHEAD_H.get(spelling, 0))
+    return judged(folder, seconds, first)
+
+
+def judged(folder: Path, since: np.ndarray = _SECONDS, first: datetime | None = None) -> str:
     """Say what the command makes of the table: right, marked (what is wrong is listed as a guess), asked, refused, or what is wrong."""
     try:
         path, missing = write_campaign(folder, Asker(None))
@@ -167,8 +230,10 @@ def judged(folder: Path) -> str:
     guessed = campaign.record.guessed
     wrong = []
     seconds = (data["time"].values - data["time"].values[0]) / np.timedelta64(1, "s")
-    if seconds.size != _SECONDS.size or np.abs(seconds - _SECONDS).max() > 0.01:
-        wrong += [] if "time_unit" in guessed else ["time"]
+    if seconds.size != since.size or np.abs(seconds - since).max() > 0.02:
+        wrong += [] if {"time_unit", "time_format"} & {*guessed} else ["time"]
+    if first is not None and abs(data["time"].values[0] - np.datetime64(first)) > np.timedelta64(1, "s"):
+        wrong += [] if {"time_unit", "date_order", "start"} & {*guessed} else ["date"]
     for role, dimension in (("temperature", "sensor"), ("displacement", "channel")):
         expected = {name: truth for name, truth in _TRUTH.items() if (name[0] == "T") == (role == "temperature")}
         read = {str(name): data[role].sel({dimension: name}).values for name in data[dimension].values}
@@ -181,7 +246,10 @@ def judged(folder: Path) -> str:
             values = next((one for heading, one in read.items() if heading.startswith(name.partition(" (")[0])), None)
             if values is None:
                 wrong.append(f"{name} left out")
-            elif values.size != truth.size or np.abs(values - truth).max() > 0.01 + 1e-3 * np.abs(truth).max():
+            elif (
+                values.size != since.size
+                or np.abs(values - truth[: since.size]).max() > 0.01 + 1e-3 * np.abs(truth).max()
+            ):
                 wrong += [] if any(one.startswith(name) for one in guessed) else [name]
     return "wrong: " + ", ".join(wrong) if wrong else "marked" if guessed else "right"
 
@@ -201,6 +269,16 @@ def counted(tmp_path: Path, chosen: list[tuple[str, str, str, str]]) -> tuple[Co
         answers[answer.partition(":")[0]] += 1
         wrong += [f"{', '.join(cell)}: {answer}"] if answer.startswith("wrong") else []
     return answers, wrong
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_no_spelling_of_a_clock_is_wrong_in_silence(tmp_path: Path, spelling: str) -> None:
+    answers = []
+    for k, date in enumerate(DATES):
+        (folder := tmp_path / str(k)).mkdir()
+        answers.append(judged_spelling(folder, spelling, *date))
+    print(f"{spelling}: {', '.join(answers)}")
+    assert not any(answer.startswith("wrong") for answer in answers)
 
 
 def test_some_tables_of_the_matrix(tmp_path: Path) -> None:
