@@ -217,7 +217,7 @@ def simulated_table(sensors: Sensors) -> xr.Dataset:
 
 
 def test_sound_sensors_of_simulated_records_are_not_accused(capsys: pytest.CaptureFixture[str]) -> None:
-    accused, sound, found = 0, 0, dict.fromkeys(SPOILT, 0)
+    accused, suspected, sound, found = 0, 0, 0, dict.fromkeys(SPOILT, 0)
     seeds = range(first_seed(8000), first_seed(8000) + 2 * RUNS)
     for kind in ("sound", *SPOILT):
         for seed in seeds:
@@ -229,14 +229,22 @@ def test_sound_sensors_of_simulated_records_are_not_accused(capsys: pytest.Captu
                 spoilt = f"t{place + 1}"
                 spoil_sensor(rng, kind, sensors.seconds, sensors.temperature[:, place])
             health = examine_record(simulated_table(sensors), ["quasi_static"])
-            named = {one.sensor for one in health.findings if one.quantity == "temperature"}
-            accused += len(named - {spoilt})
+            faults = [one for one in health.findings if one.quantity == "temperature"]
+            doubted = {one.sensor for one in faults if one.state == "suspected"} - {spoilt}
+            named = {one.sensor for one in faults}
+            suspected += len(doubted)
+            accused += len(named - doubted - {spoilt})
             sound += sensors.temperature.shape[1] - (kind in SPOILT)
             if kind in SPOILT:
                 found[kind] += spoilt in named
     with capsys.disabled():
-        print(f"sound sensors accused: {rate(accused, sound)}; found of {len(seeds)}: {found}", flush=True)
+        print(
+            f"sound sensors left out: {rate(accused, sound)}; suspected, with a reason, and kept: {rate(suspected, sound)}"
+        )
+        print(f"found of {len(seeds)}: {found}", flush=True)
     assert accused <= 0.02 * sound
+    # Mostly heaters whose set point is not logged, when they are switched on: the same record stands behind every kind of fault.
+    assert suspected <= 0.06 * sound
     for kind, share in SPOILT.items():
         assert found[kind] >= share * len(seeds) - 3.0 * np.sqrt(share * (1.0 - share) * len(seeds))
 

@@ -528,7 +528,9 @@ def no_readings(values: Array) -> NDArray[np.bool_]:
     if rest.size and length > excursion_limit(1) * max(ordinary, _LEAST_REPEATED / _MOVES):
         away_K = float(np.abs(rest - known[first]).min())
         is_level = rest.max() < known[first] <= _HEATED_DEGC and np.round(known[first] / _SET_STEP_K, 6) % 1.0 == 0.0
-        if away_K > max(_RAIL_K, float(np.ptp(rest))) and not is_level:
+        # What is constant otherwise too, as a set point that nothing follows, is no course that a rail could lie away from.
+        moves = np.count_nonzero(np.diff(rest)) >= _LEAST_HELD
+        if moves and away_K > max(_RAIL_K, float(np.ptp(rest))) and not is_level:
             none |= values == known[first]
     return none
 

@@ -139,6 +139,10 @@ def test_a_level_that_a_heater_may_hold_to_the_digit_is_no_rail(level: float, fo
     assert no_readings(values).sum() == found
 
 
+def test_a_set_point_that_nothing_follows_reads_no_rail():
+    assert not no_readings(np.repeat([0.0, 180.0, 144.0, 0.0], [500, 200, 100, 400])).any()
+
+
 @pytest.mark.parametrize(("repeated", "stuck"), [(28, False), (300, True)])
 def test_rounded_noise_repeats_its_most_frequent_value_by_chance(repeated: int, stuck: bool):
     """Three readings of four are 12.0, so that 20 in a row are expected among 2000."""
