@@ -49,6 +49,8 @@ def find_unit(text: str) -> Unit | None:
     """Return the unit that a text names, or the share of one; None where it is none."""
     # Two signs are used for micro: the Greek letter and the micro sign.
     written = with_degree_sign(text).replace("μ", "µ")
+    if written[:1] in "[(" and written[-1:] in "])":
+        written = written[1:-1].strip()
     if (share := SHARE.match(written)) and (whole := find_unit(written[share.end() :])):
         tens = int(share["power"] or len(share["over"] or "") or len(share["zeros"] or "") + 1)
         part = Unit("", whole.kind, whole.factor / 10.0**tens, whole.offset)

@@ -18,7 +18,6 @@ from fusion.campaign.logs import (
     MONITORED,
     PARTS,
     Rows,
-    has_unit,
     numbers_in,
     parts_of_time,
     read_rows,
@@ -33,6 +32,7 @@ from fusion.campaign.values import (
     TIME_UNITS,
     column_unit,
     conversion,
+    has_unit,
     is_time,
     is_unit,
     name_and_unit,
@@ -81,7 +81,7 @@ _VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{
 #: Marks of loggers and drivers of sensors for "no reading" that look like numbers.
 _MARKS = tuple(_VOCABULARY["marks"])
 #: Words in brackets that may be a unit, beside which a temperature has no usual one; a factor beside a unit.
-_NO_UNITS = frozenset(_VOCABULARY["no_units"])
+_NO_UNITS, _OF_SIGNALS = frozenset(_VOCABULARY["no_units"]), frozenset(_VOCABULARY["of_signals"])
 _FACTOR = re.compile(r"[x×*·/]?\s*\d[\d.,eE^/+-]*\s*[x×*·]?|[x×*·]")
 #: What a DS18B20 gives before its first conversion, degC and degF (Maxim, data sheet 19-7487), this far from its neighbours, K.
 _POWER_ON, _POWER_ON_JUMP = (85.0, 185.0), 5.0
@@ -653,12 +653,18 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
             return replace(
                 known, role=role or ("out" if of_rest == "driver" else of_rest), unit=unit, remark=UNIT_NOT_KNOWN
             )
+        if role == "displacement" and unit in _OF_SIGNALS:
+            return replace(known, remark=UNIT_NOT_KNOWN)
+        if role == "displacement" and '"' in heading and of_unit == "driver":
+            return replace(known, role=role, remark=UNIT_NOT_KNOWN)
         if role == "temperature" and of_unit == "displacement" and (len(word) > 2 or unit in ("m", "in")):
             return replace(known, role=role, remark=UNIT_NOT_KNOWN)
         taken = role == "out" or (role == "driver" and of_unit == "displacement")
         return replace(known, role=role if taken and of_unit != "temperature" else of_unit)
     if role == "out":
         return known
+    if role in ("temperature", "displacement") and any(map(has_unit, re.findall(r"[\[(]([^\])]*)", name))):
+        return replace(known, role=role, unit=name, remark=UNIT_NOT_KNOWN)
     if low == high:
         return replace(known, remark="constant")
     if role == "driver":

@@ -27,10 +27,12 @@ from fusion.analysis.alignment.sensor_health import SensorFault, examine_reading
 from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LoggedTable, LongTable, RecordTable
 from fusion.campaign.time_zones import bring_to_utc, from_zone
 from fusion.campaign.values import (
+    BESIDE,
     DAY_NUMBERS,
     TIME_UNITS,
     QuantityError,
     column_conversion,
+    has_unit,
     is_unit,
     name_and_unit,
     role_of_unit,
@@ -111,10 +113,10 @@ MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d\s\d\d:\d\d:\d\d(\.\d+)?\s+\S")
 _LIQUID_AIR_K = 79.0
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
-#: A number and the unit beside it in one cell.
-_BESIDE = re.compile(r"([-+−]?[\d.,]*\d(?:[eE][-+]?\d+)?)\s*([^\s\d].*)")
 #: What a line that sums up those above it is called.
 _SUMMARY = re.compile(rf"(?<![^\W\d_])({'|'.join(vocabulary('columns')['summaries'])})(?![^\W\d_])", re.IGNORECASE)
+#: Most lines of a table that sum it up.
+_MOST_SUMMARIES = 5
 #: Where seconds count from in a table whose start is not stated.
 NO_START = np.datetime64("1970-01-01", "ns")
 
@@ -583,7 +585,9 @@ def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) 
         # 20260309063000 is no number.
         if frame[number].between(19e12, 22e12).all():
             frame[str(number)] = frame[number].map("{:.0f}".format).str.replace(r"^(\d{8})", r"\1T", regex=True)
-    return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
+    return Rows(
+        frame, {str(name): unit.strip("[]() ") for name, unit in zip(frame.columns, units, strict=False)}, left_out
+    )
 
 
 def _without_marks(path: Path, rows: Rows, missing: Sequence[float]) -> Rows:
@@ -601,6 +605,9 @@ def _without_marks(path: Path, rows: Rows, missing: Sequence[float]) -> Rows:
             if 2 * sum(map(has_unit, sample)) > len(sample):
                 frame[name], units[name] = _unit_in_cells(path, name, texts)
             elif 2 * np.isfinite(numbers_in(sample)).sum() <= len(sample):
+                named = filled[filled.map(_SUMMARY.fullmatch).notna()]
+                few = len(named) <= min(_MOST_SUMMARIES, len(frame) / 10)
+                summaries.update(zip(named.index, named, strict=True) if few else ())
                 continue
         numbers = numbers_in(frame[name])
         known = units.get(name, "").strip("- ") or name_and_unit(name)[1]
@@ -631,14 +638,9 @@ def _without_marks(path: Path, rows: Rows, missing: Sequence[float]) -> Rows:
     return Rows(frame.drop(index=list(summaries)), units, [*rows.left_out, *left_out], marks)
 
 
-def has_unit(text: str) -> bool:
-    """Whether a cell holds a number with its unit."""
-    return (match := _BESIDE.fullmatch(text)) is not None and is_unit(match[2])
-
-
 def _unit_in_cells(path: Path, name: str, texts: pd.Series) -> tuple[pd.Series, str]:
     """Return the numbers of cells such as "23.5 °C", in the unit that most of them have, and that unit."""
-    parts = [_BESIDE.fullmatch(text) for text in texts]
+    parts = [BESIDE.fullmatch(text) for text in texts]
     written = [unit_name(part[2]) if part else "" for part in parts]
     most = Counter(filter(None, written)).most_common(1)[0][0]
     numerals, whole = Numerals.of(part[1] for part in parts if part), find_unit(most)
@@ -778,9 +780,11 @@ def read_times(
     if words == NO_ZONE and (zone := _zone_in(" ".join(headings))):
         time, words = from_zone(time, zone, file=path.name), f"converted to UTC from {zone}, as the heading says"
     same = np.flatnonzero(np.diff(time) == np.timedelta64(0)) + 1
-    if same.tolist() == [len(time) - 1]:
+    if same.size and same.size <= _MOST_SUMMARIES and same[0] == len(time) - same.size:
         # What alone repeats a time, at the end, sums up the rows above it.
-        time[-1] = np.datetime64("NaT")
+        time[same] = np.datetime64("NaT")
+    else:
+        same = same[:0]
     timed = ~np.isnat(time)
     cells = frame[list(headings)]
     left_out = [
@@ -788,7 +792,7 @@ def read_times(
             path.name,
             int(frame.index[at]),
             " ".join(map(str, cells.iloc[at].dropna())),
-            "repeats the time of the line above" if at == len(time) - 1 and at in same else "is not a time",
+            "repeats the time of the line above" if at in same else "is not a time",
         )
         for at in np.flatnonzero(~timed)
     ]

@@ -44,10 +44,14 @@ _CYCLES = re.compile(r"\s*(\d{1,99})(?:\s*-\s*(\d{1,99}))?\s*")
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 #: The same as ISO 80000 writes it, ``"T1 / °C"``; without spaces of a time alone, as m/s is a unit.
 _QUOTIENT = re.compile(r"\s*(?:(.+?)(?:\s+/\s+|,\s*)|(t|time|zeit)/)(\S.*?)\s*", re.IGNORECASE)
+#: A number and the unit beside it.
+BESIDE = re.compile(r"([-+−]?[\d.,]*\d(?:[eE][-+]?\d+)?)\s*([^\s\d].*)")
 #: Numbers of logger and sensor that HOBOware writes behind a heading.
 _SERIAL = re.compile(r"\s*\((?:LGR|SEN)[^()]*\)")
 #: A factor beside a name: whether the numbers were multiplied by it or are to be is not known.
-_TIMES = re.compile(r"\s*[\[(]?\s*([x×*·/]\s*10+|(?:[x×*·]\s*)?(?:10\^-?|1[eE]-?)\d+)\s*[\])]?\s*$")
+_TIMES = re.compile(
+    r"\s*[\[(]?\s*(/\s*10+|[×*·]\s*\d[\d.,]*|(?<![^\W_])x\s*(?:10+|0?[.,]\d+)|(?:[×*·]\s*|(?<![^\W_])x\s*)?(?:10\^-?|1[eE]-?)\d+)\s*[\])]?\s*$|^\s*(\d[\d.,eE^-]*\s*[x×*·])\s*"
+)
 
 
 class QuantityError(FusionError):
@@ -72,9 +76,16 @@ def name_and_unit(heading: str) -> tuple[str, str]:
         name, unit = match[1], unit_name(match[2])
     elif (match := _QUOTIENT.fullmatch(text)) and is_unit(match[3]):
         name, unit = match[1] or match[2], unit_name(match[3])
-    if (times := _TIMES.search(name)) and times.start():
-        return name[: times.start()], f"{times[1]} {unit}".strip()
+    if find_unit(unit) is None and has_unit(unit):
+        return text, ""  # Z (100 mm): where it is
+    if (times := _TIMES.search(name)) and times[0] != name:
+        return name.replace(times[0], ""), f"{(times[1] or times[2]).strip()} {unit}".strip()
     return name, unit
+
+
+def has_unit(text: str) -> bool:
+    """Whether a text holds a number with its unit."""
+    return (match := BESIDE.fullmatch(text)) is not None and is_unit(match[2])
 
 
 def conversion(unit: str, target: str) -> tuple[float, float]:
@@ -102,7 +113,7 @@ def column_conversion(unit: str, target: str) -> tuple[float, float]:
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit that columns of loggers have."""
-    return find_unit(text) is not None or text.strip() in OF_LOGGERS
+    return find_unit(text) is not None or text.strip("[]() ") in OF_LOGGERS
 
 
 def role_of_unit(unit: str) -> Literal["temperature", "displacement", "driver"]:

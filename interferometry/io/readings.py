@@ -447,9 +447,6 @@ def _understand(grid: Grid, at: int, line: int, headings: list[Heading]) -> Long
     if rows and None in units.values() and _is_row_of_units(rows[0][1]):
         units = {role: unit or unit_of_test(_cell(rows[0][1], columns.get(role))) for role, unit in units.items()}
         rows = rows[1:]
-    for role in ("position", "deviation" if "deviation" in columns else "measured"):
-        if units[role] is None:
-            _refuse_unknown_unit(grid, line, headings[columns[role]])
     if "deviation" in columns and units.get("measured") is None:
         columns.pop("measured", None)
     if "direction" in columns:
@@ -459,15 +456,6 @@ def _understand(grid: Grid, at: int, line: int, headings: list[Heading]) -> Long
     ignored = [heading.text for i, heading in enumerate(headings) if heading.text and i not in columns.values()]
     width = max(i for i, heading in enumerate(headings) if heading.text) + 1
     return LongTable(grid, line, columns, {role: unit for role, unit in units.items() if unit}, width, rows, ignored)
-
-
-def _refuse_unknown_unit(grid: Grid, line: int, heading: Heading) -> None:
-    """Refuse a heading whose brackets hold what may be a unit and is none that is known."""
-    if heading.unknown:
-        raise LaserFormatError(
-            f"{grid.place}, line {line}: {heading.unknown!r} in {heading.text!r} is no unit of a position or deviation; write nm, um, "
-            "mm, m, in, mil or uin, of a rotary axis deg, arcmin or arcsec, and convert what is a share of a length"
-        )
 
 
 def _with_words(rows: list[tuple[int, list[str]]], column: int) -> list[tuple[int, list[str]]]:
@@ -570,10 +558,10 @@ def _read_labels(table: _Labelled, stated: Stated) -> Readings:
     value = value or (position if of_positions else None)
     lacking = {}
     if position is None:
-        lacking["position_unit"] = "no heading states the unit of the positions"
+        lacking["position_unit"] = "no heading states a unit of the positions that is read"
     if value is None:
         largest = f", the largest of which is {np.nanmax(np.abs(numbers), initial=0.0):g}"
-        lacking["deviation_unit"] = f"no heading states the unit of the deviations{largest}"
+        lacking["deviation_unit"] = f"no heading states a unit of the deviations that is read{largest}"
     if position is not None and position.factor != 1.0:
         labels = [replace(label, position=label.position * position.factor) for label in labels]
     if isinstance(directed := _with_directions(table, labels, order, stated.directions), str):
@@ -1045,21 +1033,6 @@ def read_wide_table(table: WideTable, stated: Stated) -> Readings:
     """Read the values of a table of position by run."""
     numerals = table.grid.numerals
     deviation = table.deviation_unit or next((run.unit for run in table.runs if run.unit), None)
-    lacking = {
-        role
-        for role, unit, of_key in (
-            ("deviation", deviation, stated.deviation_unit), ("position", table.position_unit, stated.position_unit)
-        )
-        if unit is None and of_key is None
-    }  # fmt: skip
-    for line, fields in table.grid.rows:
-        for text, following in itertools.pairwise([*fields, ""] if line <= table.line + _ROWS_BELOW else ()):
-            word, _, rest = re.sub(r"\s*[:=]\s*", " ", text).partition(" ")
-            heading = (
-                Heading(text, "deviation", None, rest or following) if fold(word) in UNIT_WORDS else read_heading(text)
-            )
-            if heading.role in lacking:
-                _refuse_unknown_unit(table.grid, line, heading)
     numbers = [run.number for run in table.runs]
     numbered = None not in numbers
     if not numbered and any(number is not None for number in numbers):

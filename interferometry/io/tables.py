@@ -245,20 +245,15 @@ _AFTER_MARK = (re.compile(rf"{_MARK}({re.sub('[?]P<[a-z]+>', '?:', SHARE.pattern
 _OF_TESTS = ("length", "angle", "temperature", "pressure")
 #: End of a name that makes a share of the unit behind it, as in "1/8 um".
 _SHARE = re.compile(r"\d[/.,^]-?\d+$")
-#: What may be a unit behind a word: "(tenths)", "in counts", "um/m", "1/8 um".
-_UNKNOWN = re.compile(
-    r"(.*?\S)\s*(?:[(\[]\s*([^()\[\]]+?)\s*[)\]]|(?:\sin\s|/)\s*(\S+|\S+/\S+\s\S+)|\s(\S+/\S+|\d[\d.,/^-]*\s*[^\W\d]\w*))"
-)
 
 
 @dataclass(frozen=True)
 class Heading:
-    """A heading as it was understood: its role, None where the words are not known, its unit, or what is none."""
+    """A heading as it was understood: its role, None where the words are not known, its unit."""
 
     text: str
     role: str | None
     unit: Unit | None
-    unknown: str = ""
 
 
 def fold(text: str) -> str:
@@ -275,10 +270,6 @@ def read_heading(text: str) -> Heading:
     if role == "target" and unit is not None:
         # "Target [mm]" is the position of a target and not its number.
         role = "position"
-    if role is None and unit is None and (match := _UNKNOWN.fullmatch(text.strip())):
-        of_unknown = _ROLES.get(fold(match[1]).replace(" ", ""))
-        if of_unknown in ("position", "measured", "deviation"):
-            return Heading(text, of_unknown, None, match[2] or match[3] or match[4])
     return Heading(text, role, unit)
 
 

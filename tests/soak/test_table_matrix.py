@@ -1,4 +1,6 @@
-"""Logged tables of every clock, unit, layout and locale are read rightly, asked about, marked or refused: quoted in docs/measured.csv."""
+"""Logged tables of every clock, unit, layout and locale, and tables of deviations, are read rightly, asked about, marked or refused: quoted
+in docs/measured.csv.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ import numpy as np
 import openpyxl
 import pytest
 
+import interferometry
 from fusion.campaign.config import load_campaign
 from fusion.campaign.draft import TO_FILL, Asker, write_campaign
 from fusion.campaign.inputs import read_record
@@ -248,10 +251,150 @@ def judged(folder: Path, since: np.ndarray = _SECONDS, first: datetime | None = 
                 wrong.append(f"{name} left out")
             elif (
                 values.size != since.size
-                or np.abs(values - truth[: since.size]).max() > 0.01 + 1e-3 * np.abs(truth).max()
+                or np.nanmax(np.abs(values - truth[: since.size])) > 0.01 + 1e-3 * np.abs(truth).max()
             ):
                 wrong += [] if any(one.startswith(name) for one in guessed) else [name]
     return "wrong: " + ", ".join(wrong) if wrong else "marked" if guessed else "right"
+
+
+@dataclass(frozen=True)
+class Oddity:
+    """What is odd in a table: its headings, the cells of a row by the truth, and lines that stand at places in it, beginning with another
+    header.
+    """
+
+    heads: tuple[str, str, str] = ("T bed [°C]", "T2 (air) [°C]", "X pos [µm]")
+    cells: Callable[[int, float, float, float], tuple[object, object, object]] = lambda k, bed, air, x: (bed, air, x)
+    units_row: tuple[str, ...] = ()
+    lines: tuple[tuple[int, tuple[object, ...]], ...] = ()
+    time: str = "Time [s]"
+    second: float = 1.0
+
+
+def _f(celsius: float) -> float:
+    return 1.8 * celsius + 32.0
+
+
+def _marked(*marks: object) -> Oddity:
+    """A table in which the bed, and at the last mark all columns, give marks in place of readings."""
+
+    def cells(k: int, bed: float, air: float, x: float) -> tuple[object, object, object]:
+        at = {7 + 40 * j: mark for j, mark in enumerate(marks)}
+        return at.get(k, bed), at.get(k - 3, air), x
+
+    return Oddity(cells=cells)
+
+
+_HEADS = ("T bed", "T2 (air)", "X pos")
+ODDITIES = {
+    "T bed x10": Oddity(("T bed x10", *_HEADS[1:]), lambda k, a, b, x: (10 * a, b, x)),
+    "T bed x10 [°C]": Oddity(("T bed x10 [°C]", "T2 (air) [°C]", "X pos [µm]"), lambda k, a, b, x: (10 * a, b, x)),
+    "T bed*10": Oddity(("T bed*10", "T2 (air) [°C]", "X pos [µm]"), lambda k, a, b, x: (10 * a, b, x)),
+    "x10 in brackets": Oddity(("T bed (x10 °C)", "T2 (air) [°C]", "X pos (x10 µm)"), lambda k, a, b, x: (10 * a, b, 10 * x)),
+    "x1000 beside mm": Oddity(("T bed [°C]", "T2 (air) [°C]", "X pos x1000 (mm)")),
+    "shares": Oddity(("T bed (0.1 °C)", "T2 (air) [1/10 °C]", "X pos (1e-3 mm)"), lambda k, a, b, x: (10 * a, 10 * b, x)),
+    "shares without brackets": Oddity(("T bed 0.1 degC", "T2 (air) [°C]", "X pos 0.1 um"), lambda k, a, b, x: (10 * a, b, 10 * x)),
+    "m°C and nm": Oddity(("T bed (m°C)", "T2 (air) [°C]", "X pos [nm]"), lambda k, a, b, x: (1e3 * a, b, 1e3 * x)),
+    "tenths": Oddity(("T bed [°F]", "T2 (air) [°F]", "X pos (tenths)"), lambda k, a, b, x: (_f(a), _f(b), x / 2.54)),
+    "thou": Oddity(("T bed (degF)", "T2 (air) [deg F]", "X pos (thou)"), lambda k, a, b, x: (_f(a), _f(b), x / 25.4)),
+    "µin": Oddity(("T bed [F]", "T2 (air) [°F]", "X pos [µin]"), lambda k, a, b, x: (_f(a), _f(b), x / 0.0254)),
+    "raw": Oddity(("T bed (raw)", "T2 (air) [°C]", "X pos (steps)"), lambda k, a, b, x: (round(16 * a), b, round(8 * x))),
+    "HOBO": Oddity(
+        ("T bed, °F (LGR S/N: 12, SEN S/N: 7)", "T2 (air), °F (LGR S/N: 12, SEN S/N: 8)", "X pos, mm"),
+        lambda k, a, b, x: (_f(a), _f(b), x / 1e3),
+    ),
+    "row of units": Oddity(_HEADS, lambda k, a, b, x: (_f(a), b, x / 0.0254), ("s", "°F", "°C", "µin")),
+    "units in cells": Oddity(_HEADS, lambda k, a, b, x: (f"{_f(a):.9g} °F", f"{b:.9g}°C", f"{x / 1e3:.9g} mm")),
+    "two units in cells": Oddity(
+        _HEADS, lambda k, a, b, x: (f"{a:.9g} °C", f"{b:.9g} °C", f"{x:.9g} um" if k < 130 else f"{x / 1e3:.9g} mm")
+    ),
+    "second header in other units": Oddity(
+        cells=lambda k, a, b, x: (a, b, x) if k < 100 else (_f(a), b, x / 1e3),
+        lines=((100, ("Time [s]", "T bed [°F]", "T2 (air) [°C]", "X pos [mm]")),),
+    ),
+    "second row of units": Oddity(
+        _HEADS, lambda k, a, b, x: (a, b, x) if k < 100 else (_f(a), _f(b), x / 1e3), ("s", "°C", "°C", "µm"),
+        ((100, ("s", "°F", "°F", "mm")),),
+    ),
+    "second header of exchanged columns": Oddity(
+        cells=lambda k, a, b, x: (a, b, x) if k < 100 else (x, b, a),
+        lines=((100, ("Time [s]", "X pos [µm]", "T2 (air) [°C]", "T bed [°C]")),),
+    ),
+    "second header, the same": Oddity(lines=((100, ("Time [s]", "T bed [°C]", "T2 (air) [°C]", "X pos [µm]")),)),
+    "sum in a cell": Oddity(lines=((217, (130200, 24.5, 22.5, "22 avg")),)),
+    "mean, max, std": Oddity(lines=tuple((217, (name, 24.5, 22.5, 22)) for name in ("Mean", "Max:", "Std Dev"))),
+    "mean as last row": Oddity(lines=((217, (129600, 24.5, 22.5, 22)),)),
+    "85 and -127": _marked(85.0, -127.0),
+    "-7999 and NAN": _marked(-7999, "NAN"),
+    "OL": _marked("OL", "Over", "-OVER"),
+    "9999": _marked(9999, 6999, -999.9),
+    "3276.7": _marked(3276.7, -3276.8, 32767),
+    "9.9e37": _marked(9.9e37, "---", "#N/A"),
+    "t [m]": Oddity(time="t [m]", second=60.0),
+    "Temps (mn)": Oddity(time="Temps (mn)", second=60.0),
+    "Temps": Oddity(time="Temps", second=60.0),
+    "a probe that is called T": Oddity(("T bed [°C]", "T2 (air) [°C]", "X pos [µm]"), time="elapsed (min)", second=60.0),
+    "centi": Oddity(("T bed [centi]", "T2 (air) [°C]", "X pos [furlong]"), lambda k, a, b, x: (100 * a, b, x / 1e3)),
+}  # fmt: skip
+
+
+def write_odd(folder: Path, oddity: str, clock: str, locale: str) -> None:
+    """Write one odd table."""
+    odd, (mark, decimal, _) = ODDITIES[oddity], LOCALES[locale]
+
+    def written(cell: object) -> str:
+        return str(cell).replace(".", decimal) if not isinstance(cell, str) or cell[:1].isdigit() else cell
+
+    def time(seconds: float) -> object:
+        return round(seconds / odd.second, 9) if (form := CLOCKS[clock]) is None else form(seconds)
+
+    rows: list[tuple[object, ...]] = []
+    values = zip(*(_TRUTH[name] for name in _HEADS), strict=True)
+    for k, (seconds, (bed, air, x)) in enumerate(zip(_SECONDS, values, strict=True)):
+        rows += [one for at, one in odd.lines if at == k]
+        rows.append((time(seconds), *odd.cells(k, bed, air, x)))
+    for _, (first, *others) in (one for one in odd.lines if one[0] == 217):
+        rows.append((first if isinstance(first, str) else time(float(str(first))), *others))
+    heads = [odd.time if CLOCKS[clock] is None else "Time", *odd.heads]
+    lines = [heads, *([odd.units_row] if odd.units_row else []), *([written(cell) for cell in row] for row in rows)]
+    text = "\n".join(mark.join(f'"{cell}"' if mark in cell else cell for cell in line) for line in lines)
+    (folder / "log.csv").write_text(text + "\n", encoding="utf-8")
+
+
+#: Deviations by cycle, direction and target, um, and how headings call the runs; None where they name no direction.
+_POSITIONS = np.array([0.0, 100.0, 200.0, 300.0, 400.0])
+_DEVIATIONS = np.arange(3)[:, None, None] * 0.1 + np.array([0.0, 2.0])[:, None] + 0.01 * _POSITIONS
+_RUNS = {"1+": ("{}+", "{}-"), "F1": ("F{}", "R{}"), "→ 1": ("→ {}", "← {}"), "X1f": ("X{}f", "X{}b"), "Run 1": None}
+#: How the unit is stated: above the table, in every heading, factor of the numbers; "measured": positions in place of deviations.
+_STATED = {
+    "none": ("", "", 1.0), "none, mm": ("", "", 1e-3), "none, 0.1 um": ("", "", 10.0), "title": ("Deviations in 0.1 µm", "", 10.0),
+    "um": ("", " [µm]", 1.0), "mm": ("", " [mm]", 1e-3), "tenths": ("", " (tenths)", 1 / 2.54),
+    "title, tenths": ("Deviations [tenths]", "", 1 / 2.54),
+    "measured": ("", "", 1.0), "x10": ("Deviations x10 [µm]", "", 10.0),
+}  # fmt: skip
+
+
+def _deviations(folder: Path, runs: str, stated: str, locale: str) -> str:
+    """Write a table of deviations by run, and say what its reader makes of it."""
+    (mark, decimal, _), (title, unit, factor) = LOCALES[locale], _STATED[stated]
+    if (names := _RUNS[runs]) is not None:
+        heads = [names[d].format(cycle + 1) + unit for cycle in range(3) for d in (0, 1)]
+    else:
+        heads = [f"Run {k + 1}{unit}" for k in range(6)]
+    values = _DEVIATIONS.reshape(6, 5).T * factor
+    values = _POSITIONS[:, None] + values / 1e3 if stated == "measured" else values
+    rows = [
+        ["Position [mm]", *heads],
+        *([f"{p:g}", *map("{:.6f}".format, row)] for p, row in zip(_POSITIONS, values, strict=True)),
+    ]
+    lines = [mark.join(rows[0]), *(mark.join(cell.replace(".", decimal) for cell in row) for row in rows[1:])]
+    (folder / "laser.csv").write_text("\n".join([*filter(None, [title]), *lines]) + "\n", encoding="utf-8")
+    try:
+        read = interferometry.read_deviations(folder / "laser.csv")
+    except InterferometryError as error:
+        return "asked" if "state " in str(error) else "refused"
+    right = read["deviation"].shape == (3, 2, 5) and np.allclose(read["deviation"].values, _DEVIATIONS, atol=1e-3)
+    return "right" if right else "wrong"
 
 
 def cells() -> Iterator[tuple[str, str, str, str]]:
@@ -285,6 +428,34 @@ def test_some_tables_of_the_matrix(tmp_path: Path) -> None:
     """The quick form: every 59th table, so that all clocks, units, layouts and locales come up."""
     answers, wrong = counted(tmp_path, list(cells())[::59])
     assert not wrong and answers["right"] >= 8
+
+
+def counted_odd(tmp_path: Path, every: int) -> tuple[Counter[str], Counter[str], list[str]]:
+    """Count the answers to odd records and to tables of deviations, and name those that are wrong."""
+    wrong, records, tests = [], Counter[str](), Counter[str]()
+    for k, cell in enumerate([*itertools.product(ODDITIES, ("number", "ISO", "12 hours"), LOCALES)][::every]):
+        (folder := tmp_path / f"odd{k}").mkdir()
+        write_odd(folder, *cell)
+        records[(answer := judged(folder)).partition(":")[0]] += 1
+        wrong += [f"{', '.join(cell)}: {answer}"] if answer.startswith("wrong") else []
+    for k, cell in enumerate([*itertools.product(_RUNS, _STATED, LOCALES)][::every]):
+        (folder := tmp_path / f"laser{k}").mkdir()
+        tests[answer := _deviations(folder, *cell)] += 1
+        wrong += [f"deviations {', '.join(cell)}"] if answer == "wrong" else []
+    return records, tests, wrong
+
+
+def test_some_odd_tables(tmp_path: Path) -> None:
+    """The quick form: every 13th table."""
+    records, tests, wrong = counted_odd(tmp_path, 13)
+    assert not wrong and records["right"] >= 8 and tests["right"] >= 2
+
+
+@pytest.mark.slow
+def test_no_odd_table_is_wrong_in_silence(tmp_path: Path) -> None:
+    records, tests, wrong = counted_odd(tmp_path, 1)
+    print(dict(records), dict(tests), len(wrong))
+    assert not wrong, wrong
 
 
 @pytest.mark.slow

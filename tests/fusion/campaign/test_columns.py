@@ -526,6 +526,7 @@ def record_of(folder: Path, text: str) -> xr.Dataset:
         ("time [s],bed (x10 °C),T2 [degC],Z *10^-3 [mm]", ["bed (x10 °C)", "Z *10^-3 [mm]"]),
         ("t [m],T1 [degC],T2 [degC],Z [um]", ["time_unit"]),
         ("time [s],T1 [degC],temperature 2 [mm],Z [um]", ["temperature 2 [mm]"]),
+        ("time [s],10*T1 [degC],T2 [degC] x0.1,Z (100 mm)", ["10*T1 [degC]", "T2 [degC] x0.1", "Z (100 mm)"]),
     ],
 )
 def test_a_unit_or_factor_that_is_not_understood_is_asked(tmp_path: Path, head: str, asked: list[str]) -> None:
@@ -542,6 +543,7 @@ def test_a_unit_or_factor_that_is_not_understood_is_asked(tmp_path: Path, head: 
         ('Time (mn),"Temp, °F (LGR S/N: 12, SEN S/N: 7)",T2 [oC],"Z, mm"', "{min},{F1},{T2},{mm}"),
         ("Time,T1,T2,Z", "{min} min,{F1} °F,{T2} °C,{Z} um"),
         ("Time,T1,T2,Z\nmin,°F,°C,µin", "{min},{F1},{T2},{uin}"),
+        ("Time,T1,T2,Z,raw Z\n[min],[°F],[°C],[µin],[mV]", "{min},{F1},{T2},{uin},{Z}"),
     ],
 )
 def test_units_that_are_stated_are_read_wherever_they_stand(tmp_path: Path, head: str, line: str) -> None:

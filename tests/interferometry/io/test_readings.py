@@ -500,7 +500,7 @@ def test_a_mark_for_no_reading_is_no_value(tmp_path, mark):
         (
             "cycle,direction,position,deviation_um",
             "{c},{d},{p},{e}",
-            "no heading states the unit of the positions; .* position_unit as one of",
+            "no heading states a unit of the positions.* position_unit as one of",
         ),
         ("cycle,direction,position_mm,deviation_degC", "{c},{d},{p},{e}", "positions in mm, deviations in degC; give"),
         (f"{HEADER},error_um", f"{LINE},{{e}}", "'deviation_um' and 'error_um' both name the deviation"),
@@ -614,12 +614,12 @@ def test_a_sheet_for_each_direction_and_positions_that_only_one_of_them_has(tmp_
 
 @pytest.mark.parametrize("unit", ["tenths", "um/m", "1/8 um", "counts"])
 @pytest.mark.parametrize("heading", ["Deviations [{}]", "Deviations in {}", "Unit: {}", "Unit,{}", "Abweichung / {}"])
-def test_a_unit_that_is_none_is_named(tmp_path, unit, heading):
-    with pytest.raises(LaserFormatError, match=f"line 1: '{unit}' in .* is no unit of a position or deviation"):
+def test_a_unit_that_is_none_is_asked_or_refused(tmp_path, unit, heading):
+    with pytest.raises(NotStated) as asked:
         read_wide(tmp_path, f"{heading.format(unit)}\nPosition [mm],1+,1-,2+,2-\n{DATA}")
-    if not heading.startswith("Unit"):
-        with pytest.raises(LaserFormatError, match=f"line 1: '{unit}' in .* is no unit of a position or deviation"):
-            read(tmp_path, SIGNS.replace("deviation_um", heading.format(unit)))
+    assert asked.value.keys == ("deviation_unit",)
+    with pytest.raises(LaserFormatError, match="no column of a deviation"):
+        read(tmp_path, SIGNS.replace("deviation_um", f"deviation [{unit}]"))
 
 
 def test_the_order_of_positions_tells_the_direction_only_of_a_test_in_both(tmp_path):
