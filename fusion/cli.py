@@ -78,22 +78,11 @@ _YEAR_S = 365 * 86400.0
 _TABLE_WIDTH = 160
 
 
-class ExportFormat(StrEnum):
-    """What `export` can write."""
-
-    csv = "csv"
-    xlsx = "xlsx"
-    png = "png"
-    gif = "gif"
-    mp4 = "mp4"
-    linuxcnc = "linuxcnc"
-    siemens840d = "siemens840d"
-    siemens840d_temperature = "siemens840d-temperature"
-    heidenhain = "heidenhain"
-    model_json = "model-json"
-    model_c = "model-c"
-    model_st = "model-st"
-    model_linuxcnc = "model-linuxcnc"
+#: What `export` can write.
+_FORMATS = (
+    "csv, xlsx, png, gif, mp4, linuxcnc, siemens840d, siemens840d-temperature, heidenhain, twincat, model-json, model-c, model-st, "
+    "model-linuxcnc"
+)
 
 
 class FrameFormat(StrEnum):
@@ -706,7 +695,7 @@ def schema(
 @app.command()
 def export(
     results: ResultsFolder,
-    format: Annotated[ExportFormat, Option("--format", help="What to write.")],
+    format: Annotated[str, Option("--format", metavar="FORMAT", help=f"What to write: {_FORMATS}.")],
     out: Annotated[Path | None, Option(help="Folder for the files; left out: RESULTS/export.")] = None,
     axis: Annotated[str | None, Option(help="Name of the axis in the control; left out: the campaign's axis.")] = None,
     spacing: Annotated[
@@ -743,7 +732,7 @@ def export(
     with _answering():
         exported = export_results(
             results,
-            format.value,
+            format,
             out or own_place(results, "export"),
             axis=axis,
             spacing_mm=None if spacing is None else read_option("--spacing", spacing, "mm"),
@@ -907,7 +896,8 @@ def plan(
             source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed
         )
         if as_json:
-            print_json(planned.describe_duty(duty))
+            dwell_s, rows = float(duty["mean_dwell"]), planned.switchings(duty)
+            print_json({"hours": float(duty["test_hours"]), "mean_dwell_s": dwell_s, "switchings": rows})
         else:
             _print_lines(planned.duty_lines(duty, power=power))
 

@@ -49,18 +49,6 @@ def propose_duty(
     return plan_duty(machine, power=power, seed=seed)
 
 
-def describe_duty(proposed: xr.Dataset) -> dict[str, object]:
-    """Return a duty schedule for other programs."""
-    return {
-        "hours": float(proposed["test_hours"]),
-        "mean_dwell_min": float(proposed["mean_dwell"]) / 60.0,
-        "power": float(proposed["power"].sel(hours=float(proposed["test_hours"])).max()),
-        "switchings": [
-            {"minute": minute, "source": name, "state": state} for minute, name, state in switchings(proposed)
-        ],
-    }
-
-
 def duty_lines(proposed: xr.Dataset, *, power: float) -> list[str]:
     """Describe a duty schedule."""
     reached = float(proposed["power"].sel(hours=float(proposed["test_hours"])).max())
@@ -136,13 +124,13 @@ def write_nc_program(path: Path, test: NextTest, *, control: str) -> None:
 def _level(text: str, units: Mapping[str, str]) -> tuple[str, float]:
     """Return a driver and its largest level from a text such as ``"spindle speed=12000"``."""
     name, _, value = (part.strip() for part in text.partition("="))
-    number = value.removesuffix(units.get(name, "")).strip()
-    if name not in units or not number.replace(".", "", 1).isdigit() or float(number) == 0.0:
-        known = ", ".join(f'"{one}=12000 {unit}"' for one, unit in units.items())
+    try:
+        return name, float(value.removesuffix(units[name]))
+    except (KeyError, ValueError):
         raise DutyPlanError(
-            f'--largest "{text}" is no driver of this record with its highest level; write, for example, {known}'
-        )
-    return name, float(number)
+            f'--largest "{text}" is no driver of this record with its highest level; write, for example, '
+            + ", ".join(f'"{one}=12000 {unit}"' for one, unit in units.items())
+        ) from None
 
 
 def _source(text: str) -> tuple[str, float]:

@@ -66,20 +66,16 @@ class DutyLaw:
                 f"the mean dwell of {self.mean_dwell_s:g} s must be longer than the least dwell of {self.least_dwell_s:g} s"
             )
 
-    def draw(self, duration_s: float, rng: np.random.Generator) -> tuple[bool, Array]:
-        """Draw the first state (True is on) and the times of switching, s, within a duration of `duration_s`."""
+    def course(self, seconds: Array, rng: np.random.Generator) -> Array:
+        """Draw one schedule: 0 or 1 at the given times (n,), s."""
+        duration_s = float(seconds[-1] - seconds[0]) + GRID_S
         count = int(duration_s / self.mean_dwell_s * 2) + 20
         switching: Array = np.zeros(0)
         while switching.size == 0 or switching[-1] < duration_s:
             dwell = self.least_dwell_s + rng.exponential(self.mean_dwell_s - self.least_dwell_s, count)
             start = switching[-1] if switching.size else 0.0
             switching = np.concatenate([switching, start + np.cumsum(dwell)])
-        return bool(rng.integers(2)), switching[switching < duration_s]
-
-    def course(self, seconds: Array, rng: np.random.Generator) -> Array:
-        """Draw one schedule: 0 or 1 at the given times (n,), s."""
-        first, switching = self.draw(float(seconds[-1] - seconds[0]) + GRID_S, rng)
-        return (np.searchsorted(switching, seconds - seconds[0], side="right") + first) % 2.0
+        return (np.searchsorted(switching, seconds - seconds[0], side="right") + rng.integers(2)) % 2.0
 
 
 def read_duty(drivers: xr.Dataset, names: Sequence[str], law: DutyLaw, *, source: str = "drivers") -> xr.DataArray:

@@ -112,11 +112,10 @@ def propose_tests(
     test, judged = under(_JUDGED_H, _JUDGED_HOLD_MIN)
     over_s = min(part_s(record), 3600.0 * _JUDGED_H)
     now_um = expected_um(responses, test, judged, over_s)
-    open_um = {}
-    for name in (*record.drivers, *record.sensors):
-        read = judged * [one.input == name for one in columns]
-        open_um[name] = float(expected_um([replace(one, noise_um=0.0) for one in responses], test, read, over_s).mean())
-    open_um = dict(sorted(open_um.items(), key=lambda item: -item[1]))
+    silent = [replace(one, noise_um=0.0) for one in responses]
+    read = {name: judged * [one.input == name for one in columns] for name in (*record.drivers, *record.sensors)}
+    each = {name: float(expected_um(silent, test, used, over_s).mean()) for name, used in read.items()}
+    open_um = dict(sorted(each.items(), key=lambda item: -item[1]))
     for hours in _HOURS:
         tried = []
         for hold_min in _HOLDS_MIN:
@@ -128,8 +127,8 @@ def propose_tests(
             ]
             tried.append((expected_um(after, test, judged, over_s), hold_min, tried_test))
         after_um, hold_min, best = min(tried, key=lambda one: float(np.mean(one[0] / now_um)))
-        shares = np.array([powers[1] for powers in best.drivers.values()])
-        changed = np.flatnonzero(np.r_[True, (np.diff(shares) != 0.0).any(axis=0)])
+        courses = {name: record.driver_sizes[name][0] * powers[1] for name, powers in best.drivers.items()}
+        changed = np.flatnonzero(np.r_[True, np.any([np.diff(one) != 0.0 for one in courses.values()], axis=0)])
         yield NextTest(
             hours,
             hold_min,
@@ -138,24 +137,18 @@ def propose_tests(
             after_um=dict(zip(record.channels, after_um.tolist(), strict=True)),
             open_um=open_um,
             minutes=(best.seconds[changed] / 60.0).tolist(),
-            levels={
-                name: (size * share[changed]).tolist()
-                for (name, (size, _)), share in zip(record.driver_sizes.items(), shares, strict=True)
-            },
+            levels={name: one[changed].tolist() for name, one in courses.items()},
             units={name: unit for name, (_, unit) in record.driver_sizes.items()},
         )
 
 
 def _course(seconds: Array, hold_min: float, rng: np.random.Generator) -> Array:
     """Draw the share of its largest level that a driver has at some times: another one after every hold, a quarter of the mean at least."""
-    share, until, courses = float(rng.choice(_SHARES)), 0.0, np.empty_like(seconds)
-    for place, now in enumerate(seconds):
-        if now >= until:
-            share = float(rng.choice([one for one in _SHARES if one != share]))
-            # In whole minutes.
-            until = now + 60.0 * max(round(0.25 * hold_min + rng.exponential(0.75 * hold_min)), 1)
-        courses[place] = share
-    return courses
+    # In whole minutes.
+    holds = 60.0 * np.maximum(np.rint(0.25 * hold_min + rng.exponential(0.75 * hold_min, seconds.size)), 1.0)
+    # Of three levels the next or the one after it.
+    places = np.cumsum(rng.integers(1, len(_SHARES), seconds.size)) % len(_SHARES)
+    return np.array(_SHARES)[places[np.searchsorted(np.cumsum(holds), seconds, side="right")]]
 
 
 def covariance_after(one: Response, seconds: Array, values: Array, *, steps: float) -> Array:

@@ -223,21 +223,11 @@ def respond(record: Record, columns: Array, events: Array, used: NDArray[np.bool
     for k, course in enumerate(record.displacement.T):
         here = used & np.isfinite(course)
         constants = _constants(record, events[..., k], here)
-        fits = (
-            _most_probable(
-                Marginal.of(record.seconds[here], course[here], constants, columns[here] / scale, ratio=ratio), ratio
-            )
+        swept = (
+            (Marginal.of(record.seconds[here], course[here], constants, columns[here] / scale, ratio=ratio), ratio)
             for ratio in _RATIOS
         )
-        _, one = max(fits, key=lambda fit: fit[0])
-        found.append(
-            replace(
-                one,
-                coefficients=one.coefficients / scale,
-                covariance=one.covariance / np.outer(scale, scale),
-                prior_u=one.prior_u / scale,
-            )
-        )
+        found.append(max((_most_probable(*one, scale) for one in swept), key=lambda fit: fit[0])[1])
     return found
 
 
@@ -248,8 +238,10 @@ def _constants(record: Record, events: Array, here: NDArray[np.bool_]) -> Array:
     return np.column_stack([runs, *happened])
 
 
-def _most_probable(marginal: Marginal, ratio: float) -> tuple[float, Response]:
-    """Return the log-likelihood and the response under the sizes of noise and coefficients for which it is largest."""
+def _most_probable(marginal: Marginal, ratio: float, scale: Array) -> tuple[float, Response]:
+    """Return the log-likelihood and the response under the sizes of noise and coefficients for which it is largest; `scale` (p,) is that
+    by which the columns were divided.
+    """
     values, vectors = np.linalg.eigh(marginal.gram)
     values, moment = np.maximum(values, 0.0), vectors.T @ marginal.moment
     # Readings that their constants use up, or that do not move, leave both at their least: the response is none.
@@ -267,9 +259,9 @@ def _most_probable(marginal: Marginal, ratio: float) -> tuple[float, Response]:
             break
     scaled = replace(marginal, moment=marginal.moment * np.sqrt(size), gram=marginal.gram * size)
     covariance = (vectors / (values / variance + 1.0 / size)) @ vectors.T
-    coefficients = covariance @ marginal.moment / variance
-    prior_u = np.full(values.size, np.sqrt(size))
-    return scaled.log_likelihood(variance), Response(coefficients, covariance, prior_u, float(np.sqrt(variance)), ratio)
+    mean, u = covariance @ marginal.moment / variance, np.full(values.size, np.sqrt(size))
+    known = Response(mean / scale, covariance / np.outer(scale, scale), u / scale, float(np.sqrt(variance)), ratio)
+    return scaled.log_likelihood(variance), known
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ Positions are in mm from the machine's zero as the laser file gives them. The va
 minus programmed, relative to the reference; what the control does with it is stated per layout.
 
 Sources: LinuxCNC, ``src/emc/motion/usrmotintf.cc`` (function ``usrmotLoadComp``); Siemens, SINUMERIK 840D sl Function Manual Extended
-Functions, K3; HEIDENHAIN, Technical Manual MANUALplus 620, "Entering compensation values", and TNC 407 (256 entries at most).
+Functions, K3; HEIDENHAIN, Technical Manual MANUALplus 620, "Entering compensation values", and TNC 407 (256 entries at most);
+Beckhoff, TF5200 axis compensation, ``kw.ssfk`` with its worked example.
 """
 
 from __future__ import annotations
@@ -356,7 +357,7 @@ def siemens840d(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
         f"; the mean reversal error belongs into MD32450 $MA_BACKLASH: {-table.reversal_um() * 1e-3:+.6f} mm on top of the value that was "
         "active (positive: the encoder leads the machine part)",
         "CHANDATA(1)",
-        f"$AA_ENC_COMP_STEP[0,{axis}]={_spacing(table):.6f}",
+        f"$AA_ENC_COMP_STEP[0,{axis}]={np.diff(table.position_mm).mean():.6f}",
         f"$AA_ENC_COMP_MIN[0,{axis}]={table.position_mm[0]:.4f}",
         f"$AA_ENC_COMP_MAX[0,{axis}]={table.position_mm[-1]:.4f}",
         f"$AA_ENC_COMP_IS_MODULO[0,{axis}]=0",
@@ -402,6 +403,36 @@ def read_heidenhain(text: str) -> tuple[Array, Array]:
     return table[head.index("AXISPOS")], table[[axis[0], head.index("BACKLASH")]]
 
 
+def twincat(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
+    """Return a list of leadscrew error compensation: both approaches at points of any distance, in 0.1 um."""
+    at, forward, reverse = np.rint(1e4 * np.array(_rows_mm(table)).T).astype(int).tolist()
+    places = {"setpoint": at, "pos": forward, "neg": reverse}
+    lines = [
+        "kopf.achs_nr 0",
+        f"kopf.log_achs_name {axis}",
+        "kw.ssfk.interval 0",
+        f"kw.ssfk.kw_startpos {at[0]}",
+        f"kw.ssfk.kw_nr_max {len(at)}",
+        "kw.ssfk.unit 1",
+        "kw.ssfk.bilateral 1",
+        *(f"kw.ssfk.table[{k}].{name} {one}" for name, values in places.items() for k, one in enumerate(values)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def read_twincat(text: str) -> tuple[Array, Array]:
+    """Read a list of leadscrew error compensation in 0.1 um, of which a table for one direction is the same for both."""
+    found = {name: float(value) for name, value in re.findall(r"^kw\.ssfk\.(\S+)\s+(-?\d+)", text, re.M)}
+    count, step = int(found.get("kw_nr_max", 0)), found.get("interval", 0.0)
+    if found.get("unit") != 1.0 or not count:
+        raise ValueError("it holds no kw.ssfk.kw_nr_max, or kw.ssfk.unit is not 1 (0.1 um)")
+    start = found.get("kw_startpos", 0.0)
+    at = [start + step * k if step else found.get(f"table[{k}].setpoint", math.nan) for k in range(count)]
+    both = ("pos", "neg") if found.get("bilateral") else ("pos", "pos")
+    values = [[found.get(f"table[{k}].{name}", 0.0) for k in range(count)] for name in both]
+    return 1e-4 * np.array(at), 1e-4 * np.array(values)
+
+
 #: Controls by the name of their format.
 CONTROLS = {
     "linuxcnc": Control(
@@ -439,6 +470,15 @@ CONTROLS = {
         read_heidenhain,
         most_points=256,
     ),
+    "twincat": Control(
+        "Beckhoff TwinCAT CNC (TF5200, ISG kernel), leadscrew error compensation kw.ssfk",
+        twincat,
+        "achskw_{axis}.lis",
+        "a value is actual position minus set position in 0.1 um: pos of the positive approach, neg of the negative one",
+        "kopf.achs_nr has to be the logical number of the axis in place of 0; P-AXIS-00175 (lr_param.ssfk) switches it on",
+        read_twincat,
+        most_points=1500,
+    ),
 }  # fmt: skip
 
 
@@ -446,13 +486,6 @@ def _rows_mm(table: ErrorTable) -> list[tuple[float, float, float]]:
     """Return position and deviation by the forward and the reverse approach, mm, as plain numbers."""
     forward, reverse = (table.deviation_um * 1e-3).tolist()
     return list(zip(table.position_mm.tolist(), forward, reverse, strict=True))
-
-
-def _spacing(table: ErrorTable) -> float:
-    """Return the distance of points that were checked to be equally spaced."""
-    spacing = table.spacing_mm()
-    assert spacing is not None
-    return spacing
 
 
 # The thermal state that a profile belongs to: when it was measured, and how warm material and air were.

@@ -212,8 +212,8 @@ def export_results(
     ----------
     results : str or Path
         Folder of a finished run.
-    format : {"csv", "xlsx", "png", "gif", "mp4", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "model-json", \
-"model-c", "model-st", "model-linuxcnc"}
+    format : {"csv", "xlsx", "png", "gif", "mp4", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "twincat", \
+"model-json", "model-c", "model-st", "model-linuxcnc"}
         Tables, a workbook, maps of the table (every cycle as PNG with a contact sheet, or a film of all), or a control;
         ``siemens840d-temperature`` is the part of the drift that follows the material temperature. The model of a record's
         drift as JSON, as a header in C, in Structured Text, or as a HAL component.

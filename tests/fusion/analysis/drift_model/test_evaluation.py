@@ -344,7 +344,9 @@ def test_an_effect_that_entered_late_has_no_held_out_error():
 
 def test_significant_effects_without_a_name_keep_the_verdict_from_being_complete():
     found = replace(result(state(fitted()), remainder()), steps=[])
-    assert found.verdict == "complete" and str(found).startswith("axis_expansion: 2.009 ± 0.037 ppm/K\nverdict: complete\n")
+    assert found.verdict == "complete" and str(found).startswith(
+        "axis_expansion: 2.009 ± 0.037 ppm/K\nverdict: complete\n"
+    )
     assert repr(found) == "LoopResult: complete; declared axis_expansion; added nothing; held-out error 0.8 -> 0.3 um"
     lag = Decision("thermal_lag", Reason.INCONSISTENT_PATTERN, {"search_p": 1e-34})
     nameless = replace(found, state=found.state.decide(lag.on_evidence(p_value=1e-5)))

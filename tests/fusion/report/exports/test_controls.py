@@ -18,9 +18,11 @@ from fusion.report.exports.controls import (
     read_active,
     read_profile,
     read_scatter_and_drift,
+    read_twincat,
     siemens840d,
     siemens_temperature,
     tabulate,
+    twincat,
 )
 from fusion.report.exports.export import predict, predict_test, remainder_um
 from fusion.results.store import read_dataset
@@ -32,10 +34,11 @@ from tests.fusion.report.exports.small_run import (
     true_profile_um,
 )
 
-#: Position (mm), and what the axis does wrong (um) by the positive and by the negative approach; written with 1 nm resolution.
+#: Position (mm), and what the axis does wrong (um) by the positive and by the negative approach; written with 1 nm resolution, of
+#: TwinCAT with 0.1 um.
 POSITION = np.array([-20.0, 0.0, 31.0, 60.0, 85.0])
 ERROR = np.array([[2.0, 0.5, -1.25, 3.0, 6.5], [1.0, -0.75, -2.0, 2.25, 5.25]])
-ROUNDING_UM = 2e-3
+ROUNDING_UM = {"twincat": 0.11}
 PROFILE = Profile(POSITION, ERROR, np.zeros((2, 5, 2, 5)))
 #: Returns the correction (um) that a control adds to the position at (approach, position).
 Corrector = Callable[[int, np.ndarray], np.ndarray]
@@ -68,7 +71,18 @@ def heidenhain_corrects(text: str) -> Corrector:
     return lambda approach, at: -1e3 * np.interp(at, table[:, 1], table[:, 3 - approach])
 
 
+def twincat_corrects(text: str) -> Corrector:
+    """A value is actual minus set position in 0.1 um, and is taken off: pos forwards, neg backwards."""
+    rows = dict(line.split() for line in text.splitlines())
+    assert rows["kw.ssfk.unit"] == rows["kw.ssfk.bilateral"] == "1" and rows["kw.ssfk.interval"] == "0"
+    assert rows["kw.ssfk.kw_startpos"] == rows["kw.ssfk.table[0].setpoint"]
+    points = range(int(rows["kw.ssfk.kw_nr_max"]))
+    at, *both = ([0.1 * int(rows[f"kw.ssfk.table[{k}].{name}"]) for k in points] for name in ("setpoint", "pos", "neg"))
+    return lambda approach, asked: -np.interp(1e3 * asked, at, both[approach])
+
+
 READERS = {
+    "twincat": twincat_corrects,
     "linuxcnc": linuxcnc_corrects,
     "siemens840d": siemens_corrects,
     "heidenhain": heidenhain_corrects,
@@ -82,19 +96,33 @@ def test_every_control_has_a_reader():
 @pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize(("spacing", "reference"), [(None, None), (10.0, None), (15.0, 31.0)])
 def test_the_control_leaves_what_is_predicted(name, spacing, reference):
-    control = CONTROLS[name]
+    control, rounding = CONTROLS[name], ROUNDING_UM.get(name, 2e-3)
     if control.equal_spacing and spacing is None:
         pytest.skip("this control needs equally spaced points")
     table = tabulate(PROFILE, spacing_mm=spacing, reference_mm=reference)
     correct = READERS[name](control.write(table, "X1", ["a header"] if control.comment else []))
     left = ERROR + np.array([correct(approach, POSITION) for approach in range(2)])
     predicted = np.ptp(remainder_um(PROFILE, table, one_table=control.one_table))
-    assert np.ptp(left) == pytest.approx(predicted, abs=ROUNDING_UM)
+    assert np.ptp(left) == pytest.approx(predicted, abs=rounding)
     assert np.ptp(left) < np.ptp(ERROR) / 2
     if spacing is None:
-        assert np.ptp(left) < ROUNDING_UM
+        assert np.ptp(left) < rounding
     at_reference = correct(0, np.array([table.reference_mm]))[0]
-    assert at_reference == pytest.approx(0.0, abs=ROUNDING_UM if not control.one_table else 0.6)
+    assert at_reference == pytest.approx(0.0, abs=rounding if not control.one_table else 0.6)
+
+
+def test_values_of_twincat_are_those_of_its_makers_example():
+    """Set 19866.7 um, reached 19856.5 um forwards and 19874.7 um backwards: -102 and 80."""
+    position = np.array([0.0, 19.8667, 40.0])
+    error = np.array([[0.0, 19856.5 - 19866.7, 0.0], [0.0, 19874.7 - 19866.7, 0.0]])
+    table = tabulate(Profile(position, error, np.zeros((2, 3, 2, 3))))
+    rows = twincat(table, "Y", ()).splitlines()
+    assert {"kw.ssfk.table[1].setpoint 198667", "kw.ssfk.table[1].pos -102", "kw.ssfk.table[1].neg 80"} <= set(rows)
+    at, deviation = read_twincat(
+        "kw.ssfk.unit 1\nkw.ssfk.interval 100000\nkw.ssfk.kw_nr_max 2\nkw.ssfk.table[1].pos 7\n"
+    )
+    np.testing.assert_allclose(at, [0.0, 10.0])
+    np.testing.assert_allclose(deviation, [[0.0, 7e-4], [0.0, 7e-4]])
 
 
 def test_comments_and_areas_of_siemens():
@@ -114,7 +142,7 @@ def origin_of(active: str, campaign_file: str = "") -> Origin:
 @pytest.mark.parametrize("spacing", [None, 15.0])
 def test_what_was_measured_under_a_table_is_added_to_it(tmp_path, name, spacing):
     """The axis errs by ERROR; a table of other points and range takes out something else; the sum brings it to zero."""
-    control, old = CONTROLS[name], np.arange(-35.0, 101.0, 15.0)
+    control, old, rounding = CONTROLS[name], np.arange(-35.0, 101.0, 15.0), ROUNDING_UM.get(name, 2e-3)
     taken = np.array([np.sin(old / 17.0) + old / 40.0, np.sin(old / 17.0) + old / 40.0])
     if not control.one_table:
         taken[1] -= 0.4 * np.cos(old / 30.0)
@@ -124,7 +152,7 @@ def test_what_was_measured_under_a_table_is_added_to_it(tmp_path, name, spacing)
     (tmp_path / "old.txt").write_text(control.write(before, "X1", []), encoding="ascii")
     active, unknown = read_active(tmp_path, control, origin_of("old table"), str(tmp_path / "old.txt"))
     assert unknown == []
-    np.testing.assert_allclose(np.diff(active.at(old)), np.diff(taken), atol=2 * ROUNDING_UM)
+    np.testing.assert_allclose(np.diff(active.at(old)), np.diff(taken), atol=2 * rounding)
     correct_before = READERS[name](control.write(before, "X1", []))
     measured = ERROR + np.array([correct_before(approach, POSITION) for approach in range(2)])
     if control.one_table:  # the backlash of the old table is not in the file
@@ -134,12 +162,12 @@ def test_what_was_measured_under_a_table_is_added_to_it(tmp_path, name, spacing)
     correct = READERS[name](control.write(table, "X1", []))
     left = ERROR + np.array([correct(approach, POSITION) for approach in range(2)])
     predicted = np.ptp(remainder_um(profile, table, one_table=control.one_table))
-    assert np.ptp(left) == pytest.approx(predicted, abs=2 * ROUNDING_UM)
+    assert np.ptp(left) == pytest.approx(predicted, abs=2 * rounding)
     if spacing is None:
         # Every point of the old table is kept, also beyond the targets, where what the ends show is held.
-        assert np.ptp(left) < 2 * ROUNDING_UM and set(old) < set(table.position_mm)
+        assert np.ptp(left) < 2 * rounding and set(old) < set(table.position_mm)
         beyond = correct(0, np.array([100.0])) - correct_before(0, np.array([100.0]))
-        assert beyond == pytest.approx(correct(0, POSITION[-1:]) - correct_before(0, POSITION[-1:]), abs=ROUNDING_UM)
+        assert beyond == pytest.approx(correct(0, POSITION[-1:]) - correct_before(0, POSITION[-1:]), abs=rounding)
 
 
 def test_a_table_that_may_have_been_active_is_asked_for(tmp_path):
