@@ -149,10 +149,14 @@ def copied(campaign_folder: Path, tmp_path: Path) -> Path:
     return shutil.copytree(campaign_folder, tmp_path / "campaign")
 
 
-@pytest.fixture
-def no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
+def draw_no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs whose page nobody looks at draw no charts: they are half of the time of a small campaign."""
     from fusion.report.charts.embedded import Drawn
 
     for name in ("_draw", "_draw_attributed"):
         monkeypatch.setattr(f"fusion.pipeline.run.{name}", lambda *_: Drawn({}))
+
+
+@pytest.fixture
+def no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw_no_charts(monkeypatch)

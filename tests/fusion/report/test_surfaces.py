@@ -36,7 +36,7 @@ from fusion.twin.instruments import simulate_campaign
 from tests.browser import CHROMIUM
 from tests.fusion.app.texts import texts
 from tests.fusion.campaign_parts import simulated
-from tests.fusion.conftest import RECIPE
+from tests.fusion.conftest import RECIPE, draw_no_charts
 from tests.fusion.report.page_tables import tables_of
 
 pytestmark = pytest.mark.chain
@@ -141,7 +141,9 @@ def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("surfaces")
     campaign = simulated(folder, f"{RECIPE}\n{ANOMALY}")
     campaign.write_text(campaign.read_text() + STATED)
-    run_campaign(campaign, folder / "results")
+    with pytest.MonkeyPatch.context() as patch:
+        draw_no_charts(patch)
+        run_campaign(campaign, folder / "results")
     return folder / "results"
 
 

@@ -50,24 +50,30 @@ def test_profile_drift_and_scatter_come_back(rng):
     assert estimated["component"].values.tolist() == ["shift", "stretch"]
 
 
-def test_profile_and_drift_and_noise_make_up_the_reading(rng):
-    deviations, _ = simulate(rng, cycles=30)
-    for state in ("mean", "start", "end", 3000.0):
-        estimated = estimate_drift(deviations, state=state)
+STATES = ("mean", "start", "end", 3000.0)
+
+
+@pytest.fixture(scope="module")
+def of_states():
+    """Thirty cycles, and their estimate for every state at which the profile can be stated."""
+    deviations, _ = simulate(np.random.default_rng(20260309), cycles=30)
+    return deviations, {state: estimate_drift(deviations, state=state) for state in STATES}
+
+
+def test_profile_and_drift_and_noise_make_up_the_reading(of_states):
+    deviations, estimates = of_states
+    for estimated in estimates.values():
         sum_of_parts = estimated["profile"] + estimated["drift"] + estimated["noise"]
         np.testing.assert_allclose(
             sum_of_parts.transpose(*deviations["deviation"].dims), deviations["deviation"], atol=1e-6
         )
 
 
-def test_the_stated_state_is_where_drift_is_zero(rng):
-    deviations, _ = simulate(rng, cycles=30)
-    start, end = (estimate_drift(deviations, state=state) for state in ("start", "end"))
-    assert float(start["drift"].values[0, 0, 0]) == pytest.approx(0.0, abs=1e-9)
-    assert float(start["drift_u"].values[0, 0, 0]) == pytest.approx(0.0, abs=1e-6)
-    assert float(end["drift"].values[-1, 1, 0]) == pytest.approx(0.0, abs=1e-9)
-    assert float(end["drift_u"].values[-1, 1, 0]) == pytest.approx(0.0, abs=1e-6)
-    middle = estimate_drift(deviations, state="mean")
+def test_the_stated_state_is_where_drift_is_zero(of_states):
+    middle, start, end, _ = of_states[1].values()
+    for one, place in ((start, (0, 0, 0)), (end, (-1, 1, 0))):
+        assert float(one["drift"].values[place]) == pytest.approx(0.0, abs=1e-9)
+        assert float(one["drift_u"].values[place]) == pytest.approx(0.0, abs=1e-6)
     assert float(middle["profile_u"].mean()) < float(start["profile_u"].mean())
 
 
