@@ -104,6 +104,7 @@ def test_frames_without_fiducials_give_pictures_and_nothing_in_mm(picture_result
     assert "column " in text and not re.search(r"\d mm\b|/ mm\b", text + shown)
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_five_cycles_give_all_but_causes_and_say_what_those_need(folder, tmp_path):
     keep_cycles(Path(shutil.copy(folder / "laser.csv", folder / "five.csv")), *range(1, 6))
     path, out = without(folder / "campaign.toml", name="five.toml"), tmp_path / "results"
@@ -278,6 +279,7 @@ def test_contact_sensors_stand_for_the_camera(folder, results_folder, tmp_path):
     assert codes["sensors_coverage"] and "sensors_rise" not in codes
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(folder, results_folder, tmp_path):
     write_sensors(folder, results_folder / "fields.nc", gain=1.5)
     path = without(folder / "campaign.toml", "interferometry", "drivers", "model", name="beside.toml", added=SENSORS)
