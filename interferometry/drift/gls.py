@@ -22,7 +22,7 @@ Biometrika 58, 545 (restricted likelihood).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TypeAlias
@@ -313,28 +313,36 @@ def _sweep(gram: Array) -> tuple[Array, float, int]:
 
 def _maximise(system: DriftSystem, response: Array, design: Design, start: Array | None) -> DriftFit:
     """Restricted maximum likelihood of the variance ratios by quasi-Newton steps in their logarithm (L-BFGS-B)."""
-    low, high = _LOG_RATIO_LIMITS[system.order]
-    components = system.loadings.shape[1]
     problem = _Problem.of(response, design)
     searched, few = _for_search(system, problem, _ENOUGH_READINGS)
     unit = _log_ratio_unit(system)
+    low, high = (np.full(unit.size, limit) for limit in _LOG_RATIO_LIMITS[system.order])
 
     def ratios(log_ratio: Array) -> Array:
         return np.asarray(10.0 ** (unit + np.clip(log_ratio, low, high)))
 
-    def cost(log_ratio: Array) -> float:
-        found = -_log_likelihood(replace(searched, ratios=ratios(log_ratio)), few)
+    def likelihood(log_ratio: Array) -> float:
+        return _log_likelihood(replace(searched, ratios=ratios(log_ratio)), few)
+
+    # Far below the noise the likelihood is level, and no gradient leads back.
+    given = 0.0 if start is None else np.maximum(np.log10(np.maximum(start, 1e-300)) - unit, _LEAST_START)
+    best, _ = _search(likelihood, np.clip(given, low, high), low, high)
+    return _solve(replace(system, ratios=ratios(best)), problem)
+
+
+def _search(likelihood: Callable[[Array], float], start: Array, low: Array, high: Array) -> tuple[Array, float]:
+    """Return where a log-likelihood is largest between limits, and its value there, by quasi-Newton steps (L-BFGS-B)."""
+
+    def cost(x: Array) -> float:
+        found = -likelihood(x)
         # Less drift is nearer to a model.
-        return found if np.isfinite(found) else _NO_MODEL * (1.0 + float((log_ratio - low).sum()))
+        return found if np.isfinite(found) else _NO_MODEL * 2.0 ** float((x - start).sum())
 
-    def with_gradient(log_ratio: Array) -> tuple[float, Array]:
-        here, step = cost(log_ratio), np.where(log_ratio + _STEP > high, -_STEP, _STEP)
-        return here, np.array([cost(log_ratio + one) - here for one in np.diag(step)]) / step
+    def with_gradient(x: Array) -> tuple[float, Array]:
+        here, step = cost(x), np.where(x + _STEP > high, -_STEP, _STEP)
+        return here, np.array([cost(x + one) - here for one in np.diag(step)]) / step
 
-    best, least = np.zeros(components), np.inf
-    if start is not None:
-        # Far below the noise the likelihood is level, and no gradient leads back.
-        best = np.clip(np.log10(np.maximum(start, 1e-300)) - unit, _LEAST_START, high)
+    best, least = start, np.inf
     # A first step as long as a gradient makes it would end where the likelihood is level: the search moves on box by box.
     for _ in range(_MOST_BOXES):
         box = np.maximum(best - _BOX, low), np.minimum(best + _BOX, high)
@@ -345,7 +353,7 @@ def _maximise(system: DriftSystem, response: Array, design: Design, start: Array
         at_edge = (best <= box[0]) & (box[0] > low) | (best >= box[1]) & (box[1] < high)
         if not at_edge.any() or before - least < _LEAST_RISE:
             break
-    return _solve(replace(system, ratios=ratios(best)), problem)
+    return best, -least
 
 
 def _log_likelihood(system: DriftSystem, problem: _Problem) -> float:
@@ -409,11 +417,10 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
 
     def likelihood(log_ratio: Array, time_s: float, exponent: float) -> float:
-        # The drift hides everything else all the time.
-        mean = np.log10(settling_noise_scale(searched.seconds, time_s, exponent).mean())
-        if (log_ratio + mean > largest).any():
-            return -np.inf
         scale = settling_noise_scale(searched.seconds, time_s, exponent)
+        # The drift hides everything else all the time.
+        if (log_ratio + np.log10(scale.mean()) > largest).any():
+            return -np.inf
         return _log_likelihood(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
 
     def with_same_mean(exponent: float) -> Array:
@@ -425,22 +432,18 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     components = system.ratios.size
     guess = np.r_[with_same_mean(likely), np.log10(first_s), likely]
     limits = np.log10(span * np.array(_SETTLING_LIMITS))
+    # The drift may hide everything on the way, where there is no gradient.
     optimum = scipy.optimize.minimize(
-        lambda x: -likelihood(x[:components], 10.0 ** x[-2], x[-1]),
-        guess,
-        method="Nelder-Mead",
+        lambda x: -likelihood(x[:components], 10.0 ** x[-2], x[-1]), guess, method="Nelder-Mead",
         bounds=[(None, None)] * components + [tuple(limits), (0.0, _FASTEST_SETTLING)],
-        options={
-            "initial_simplex": np.vstack([guess, guess + np.diag([1.0] * components + [0.5, 1.0])]),
-            "xatol": 0.03,
-            "fatol": 1e-2,
-            "maxfev": 80 * guess.size,
-        },
-    )
+        options={"initial_simplex": np.vstack([guess, guess + np.diag([1.0] * components + [0.5, 1.0])]), "xatol": 0.03,
+                 "fatol": 1e-2, "maxfev": 80 * guess.size},
+    )  # fmt: skip
     if -optimum.fun < constant + _SETTLING_MARGIN:
         return fit
-    ratios = 10.0 ** optimum.x[:components]
-    start_scale = float(np.exp(np.log(np.maximum(ratios / system.ratios, 1e-300)).mean()))
+    # By all components together: one that hardly moves may have any size.
+    unit = 10.0 ** _log_ratio_unit(system)
+    start_scale = float((10.0 ** optimum.x[:components] / unit).sum() / (system.ratios / unit).sum())
     settling = settling_noise_scale(system.seconds, 10.0 ** optimum.x[-2], optimum.x[-1])
     scale = np.maximum(1.0, start_scale * settling)
     return _solve(replace(system, process_noise_scale=scale), problem)
@@ -468,7 +471,7 @@ def _fit_memory(fit: DriftFit) -> DriftFit:
     searched, few = _for_search(system, problem)
     constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
     low, high = (limit + _log_ratio_unit(system) for limit in _LOG_RATIO_LIMITS[system.order])
-    bounds = [*zip(low, high, strict=True), _MEMORY_SHARE_LIMITS, tuple(np.log10(_MEMORY_TIME_LIMITS))]
+    bounds = np.array([*zip(low, high, strict=True), _MEMORY_SHARE_LIMITS, np.log10(_MEMORY_TIME_LIMITS)])
 
     def with_memory(x: Array, over: DriftSystem) -> DriftSystem:
         share, time_s = float(np.clip(x[-2], *_MEMORY_SHARE_LIMITS)), between_s * 10.0 ** float(x[-1])
@@ -489,22 +492,10 @@ def _fit_memory(fit: DriftFit) -> DriftFit:
     # The search gains some units over the best start at most; without a start near the margin there is nothing to find.
     if max(likely) < constant:
         return fit
-    step = np.r_[np.where(drift > high - 1.0, -1.0, 1.0), 0.1 if guess[-2] > 0.5 else 0.2, 0.3]
-    optimum = scipy.optimize.minimize(
-        lambda x: -likelihood(x),
-        guess,
-        method="Nelder-Mead",
-        bounds=bounds,
-        options={
-            "initial_simplex": np.vstack([guess, guess + np.diag(step)]),
-            "xatol": 0.01,
-            "fatol": 1e-2,
-            "maxfev": 60 * guess.size,
-        },
-    )
-    if -optimum.fun < constant + _MEMORY_MARGIN:
+    best, largest = _search(likelihood, guess, *bounds.T)
+    if largest < constant + _MEMORY_MARGIN:
         return fit
-    return _solve(with_memory(optimum.x, system), problem)
+    return _solve(with_memory(best, system), problem)
 
 
 def estimate(
