@@ -40,8 +40,9 @@ from fusion.campaign.values import (
     unit_name,
 )
 from fusion.common import FusionError
+from fusion.results.numbers import span
 from fusion.results.progress import listed
-from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError, RejectedLine
+from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
     DateOrder,
@@ -142,7 +143,7 @@ class Column:
     @property
     def span(self) -> str:
         """Range of the numbers in words, empty where the column has none."""
-        return f"{self.low:.5g} to {self.high:.5g}" if np.isfinite(self.low) else ""
+        return span(np.array([self.low, self.high])) if np.isfinite(self.low) else ""
 
 
 @dataclass(frozen=True)
@@ -325,7 +326,7 @@ def _read(
 
 def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple[list[Column], list[float]]:
     """Propose what every column holds, and which numbers are marks for no reading in all of them."""
-    numbers = {heading: _readings(series) for heading, series in groups.items()}
+    numbers = {heading: _finite(series) for heading, series in groups.items()}
     found = {heading: [mark for mark in _MARKS if _is_mark(mark, values)] for heading, values in numbers.items()}
     columns = [
         _column(heading, units.get(heading, ""), series, numbers[heading][~np.isin(numbers[heading], found[heading])])
@@ -341,12 +342,6 @@ def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple
     return columns, sorted(
         mark for mark in marks if all(mark in found[name] or mark not in numbers[name] for name in used)
     )
-
-
-def _readings(column: pd.Series) -> np.ndarray:
-    """Return the numbers of a column that can be readings."""
-    numbers = numbers_in(column)
-    return numbers[np.abs(numbers) < SENTINEL_MAGNITUDE]
 
 
 # Where names, units and values stand.

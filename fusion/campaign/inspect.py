@@ -26,7 +26,7 @@ from fusion.common import FusionError, TomlError, read_toml
 from fusion.messages import unforeseen
 from fusion.results.folder import MANIFEST
 from fusion.results.inspection import describe_product, is_product
-from fusion.results.numbers import duration, join, moment, print_unit
+from fusion.results.numbers import duration, join, moment, print_unit, span
 from fusion.results.progress import Read, clock_notices, counted, left_out_notices, listed
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError
@@ -375,9 +375,9 @@ def _columns(table: TableProposal) -> Iterator[str]:
         if len(columns) <= _COLUMNS_ALIKE:
             yield from (f"{one.heading}: {words}{f', {one.span}' if one.span else ''}" for one in columns)
             continue
-        low, high = min(one.low for one in columns), max(one.high for one in columns)
         names = f"{columns[0].heading} ... {columns[-1].heading} ({len(columns)} columns)"
-        yield f"{names}: {words}" + (f", {low:.5g} to {high:.5g}" if np.isfinite(low) else "")
+        known = [limit for one in columns if one.span for limit in (one.low, one.high)]
+        yield f"{names}: {words}" + (f", {span(known)}" if known else "")
 
 
 def _course(times: NDArray[np.datetime64], reference: str, noun: str) -> Iterator[str]:
@@ -413,8 +413,7 @@ def _describe_log(found: Recognised) -> list[str]:
         *_course(log["time"].values, log["time"].attrs["reference"], "row"),
     ]
     for variable, values in log.data_vars.items():
-        unit = "" if values.attrs["units"] == "1" else print_unit(values.attrs["units"])
-        lines.append(f"{variable} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}".rstrip())
+        lines.append(f"{variable} {span(values, values.attrs['units'], '.2f')}")
     return lines + _warnings(log)
 
 
@@ -433,7 +432,7 @@ def _describe_deviations(found: Recognised) -> list[str]:
         f"deviations, {counted(deviations.sizes['cycle'], 'cycle')}, {counted(deviations.sizes['target'], 'target')} from "
         f"{position.values.min():g} to {position.values.max():g} {position.attrs['units']}, "
         f"{int(np.isfinite(values).sum())} of {values.size} readings",
-        f"deviation {float(values.min()):.3f} to {float(values.max()):.3f} {print_unit(values.attrs['units'])}",
+        f"deviation {span(values, values.attrs['units'], '.3f')}",
         when,
         *describe_test(deviations),
         *_warnings(deviations),

@@ -780,21 +780,17 @@ def read_times(
     if words == NO_ZONE and (zone := _zone_in(" ".join(headings))):
         time, words = from_zone(time, zone, file=path.name), f"converted to UTC from {zone}, as the heading says"
     same = np.flatnonzero(np.diff(time) == np.timedelta64(0)) + 1
-    if same.size and same.size <= _MOST_SUMMARIES and same[0] == len(time) - same.size:
-        # What alone repeats a time, at the end, sums up the rows above it.
-        time[same] = np.datetime64("NaT")
-    else:
-        same = same[:0]
+    # What alone repeats a time, at the end, sums up the rows above it.
+    same = (
+        same if same.size <= _MOST_SUMMARIES and (same == len(time) - np.arange(same.size, 0, -1)).all() else same[:0]
+    )
+    time[same] = np.datetime64("NaT")
     timed = ~np.isnat(time)
     cells = frame[list(headings)]
+    written = [" ".join(map(str, row.dropna())) for _, row in cells[~timed].iterrows()]
     left_out = [
-        RejectedLine(
-            path.name,
-            int(frame.index[at]),
-            " ".join(map(str, cells.iloc[at].dropna())),
-            "repeats the time of the line above" if at in same else "is not a time",
-        )
-        for at in np.flatnonzero(~timed)
+        RejectedLine(path.name, int(frame.index[at]), text, "repeats the time above" if at in same else "is not a time")
+        for at, text in zip(np.flatnonzero(~timed), written, strict=True)
     ]
     raise_if_mostly_invalid(
         path, int(timed.sum()), left_out, last=int(frame.index[timed].max()) if timed.any() else None

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
-from fusion.results.numbers import moment, print_unit
+from fusion.results.numbers import span
 from fusion.results.store import GLOBAL_ATTRIBUTES, PRODUCTS, read_json_object
 
 _EXR, _HDF5 = b"\x76\x2f\x31\x01", b"\x89HDF\r\n\x1a\n"
@@ -50,7 +48,7 @@ def _describe_dataset(path: Path) -> Iterator[str]:
         yield f"product of a run, {product.attrs[GLOBAL_ATTRIBUTES[1]]}: {sizes}"
         for name in next((kind for stem, kind in PRODUCTS.items() if stem == path.stem), product.data_vars):
             if name in product.variables and product[name].size and product[name].dtype.kind in "fM":
-                yield f"{name} {_span(product[name].values, product[name].attrs.get('units', ''))}"
+                yield f"{name} {span(product[name].values, product[name].attrs.get('units', ''), '.4g')}"
         if path.stem == "fields":
             yield "thermofuse export RESULTS --format png, gif or mp4 draws every cycle"
 
@@ -62,14 +60,6 @@ def _describe_maps(path: Path) -> Iterator[str]:
     rows, columns = next(iter(maps.values())).shape
     known = [f"{name.replace('_', ' ')} {header[name]}" for name in ("cycle", "time", "cell_size_mm") if name in header]
     yield f"OpenEXR maps of {columns} x {rows} cells: {', '.join(known) or 'no word of a run in the header'}"
-    yield from (f"{name} {_span(values, str(header.get(name, '')))}" for name, values in maps.items() if name != "mask")
-
-
-def _span(values: np.ndarray, unit: str) -> str:
-    """Return the smallest and the largest of values with their unit."""
-    known = values[~(np.isnat(values) if values.dtype.kind == "M" else np.isnan(values))]
-    if known.size == 0:
-        return "without a value"
-    if values.dtype.kind == "M":
-        return f"{moment(known.min())} to {moment(known.max())}"
-    return f"{known.min():.4g} to {known.max():.4g} {print_unit(unit) if unit != '1' else ''}".rstrip()
+    yield from (
+        f"{name} {span(values, str(header.get(name, '')), '.4g')}" for name, values in maps.items() if name != "mask"
+    )

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from zoneinfo import ZoneInfo
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 #: Least p-value that is stated: below it a p-value is the tail of a distribution that no number of simulations or readings has shown.
 LEAST_P = 0.001
@@ -58,6 +59,16 @@ def measured(value: float | None, u: float | None, unit: str = "", *, decimals: 
 def print_unit(unit: str) -> str:
     """Return a unit as it is printed."""
     return {"degC": "°C", "percent": "%", "1": ""}.get(unit, unit.replace("um", "µm"))
+
+
+def span(values: ArrayLike, unit: str = "", form: str = ".5g") -> str:
+    """Return the smallest and the largest value, without those that are none, with their unit."""
+    every = np.asarray(values)
+    known = every[~np.isnat(every) if every.dtype.kind == "M" else ~np.isnan(every)]
+    if known.size == 0:
+        return "without values"
+    low, high = (moment(one) if known.dtype.kind == "M" else f"{one:{form}}" for one in (known.min(), known.max()))
+    return f"{low} to {high} {print_unit(unit)}".rstrip()
 
 
 def small(value: float | None) -> str:

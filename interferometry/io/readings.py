@@ -693,20 +693,10 @@ def _label(table: LongTable, line: int, fields: list[str]) -> _Label:
     numbers = next((columns[role] for role in ("cycle", "run") if role in columns), None)
     number = 0 if numbers is None else _count(fields[numbers], numerals)
     target = _count(fields[columns["target"]], numerals) if "target" in columns else 0
-    position, value, measured = (
-        fields[columns.get(role, columns.get("measured", -1))] for role in ("position", "deviation", "measured")
-    )
-    where = numerals.reading(position)
-    return _Label(
-        line,
-        number,
-        *direction,
-        target,
-        where,
-        value if "deviation" in columns else measured,
-        measured=measured,
-        time=_time_text(table, fields),
-    )
+    where = numerals.reading(fields[columns["position"]])
+    measured = fields[columns["measured"]] if "measured" in columns else ""
+    value = fields[columns["deviation"]] if "deviation" in columns else measured
+    return _Label(line, number, *direction, target, where, value, None, measured, _time_text(table, fields))
 
 
 def _count(text: str, numerals: Numerals) -> int:

@@ -44,6 +44,7 @@ from bokeh.plotting import figure
 
 from fusion.common import own_name
 from fusion.report.charts.embedded import EmbeddedChart, in_script
+from fusion.results.numbers import span
 from interferometry.plots import ACCENT, COLOURS, GRID, INK, MUTED
 
 #: Colours of named lines, each readable on white and distinguishable by colour-blind readers together with the dashes of `DASHES`.
@@ -336,11 +337,7 @@ def fix_range(drawn: figure, low: float, high: float) -> None:
 
 def span_words(values: np.ndarray | xr.DataArray, unit: str) -> str:
     """Return the smallest and the largest value, NaN left out, as "−1.25 to 3.00 µm", for text alternatives."""
-    every = np.asarray(values, float)
-    if not np.isfinite(every).any():
-        return "without values"
-    low, high = float(np.nanmin(every)), float(np.nanmax(every))
-    return f"{low:.2f} to {high:.2f} {unit}".replace("-", "−")
+    return span(values, unit, ".2f").replace("-", "−")
 
 
 # Charts in a page: each with its text alternative and its data.
