@@ -94,6 +94,7 @@ def propose_tests(
     longest = record.run == np.bincount(record.run).argmax()
     room, at = (record.rise - warmed @ per_load)[longest], record.seconds[longest] - record.seconds[longest][0]
     highest = {name: (largest or {}).get(name, size) / size for name, (size, _) in record.driver_sizes.items()}
+    units = {name: unit for name, (_, unit) in record.driver_sizes.items()}
     rng = np.random.default_rng(seed)
 
     def under(hours: float, hold_min: float) -> tuple[Record, Array]:
@@ -119,27 +120,17 @@ def propose_tests(
     for hours in _HOURS:
         tried = []
         for hold_min in _HOLDS_MIN:
-            tried_test, values = under(hours, hold_min)
-            steps = record.block_s / tried_test.block_s
-            after = [
-                replace(one, covariance=covariance_after(one, tried_test.seconds, values, steps=steps))
-                for one in responses
-            ]
-            tried.append((expected_um(after, test, judged, over_s), hold_min, tried_test))
+            duty, values = under(hours, hold_min)
+            steps = record.block_s / duty.block_s
+            left = [covariance_after(one, duty.seconds, values, steps=steps) for one in responses]
+            after = [replace(one, covariance=open_) for one, open_ in zip(responses, left, strict=True)]
+            tried.append((expected_um(after, test, judged, over_s), hold_min, duty))
         after_um, hold_min, best = min(tried, key=lambda one: float(np.mean(one[0] / now_um)))
         courses = {name: record.driver_sizes[name][0] * powers[1] for name, powers in best.drivers.items()}
         changed = np.flatnonzero(np.r_[True, np.any([np.diff(one) != 0.0 for one in courses.values()], axis=0)])
-        yield NextTest(
-            hours,
-            hold_min,
-            over_s / 3600.0,
-            now_um=dict(zip(record.channels, now_um.tolist(), strict=True)),
-            after_um=dict(zip(record.channels, after_um.tolist(), strict=True)),
-            open_um=open_um,
-            minutes=(best.seconds[changed] / 60.0).tolist(),
-            levels={name: one[changed].tolist() for name, one in courses.items()},
-            units={name: unit for name, (_, unit) in record.driver_sizes.items()},
-        )
+        now, later = (dict(zip(record.channels, one.tolist(), strict=True)) for one in (now_um, after_um))
+        minutes, levels = best.seconds[changed] / 60.0, {name: one[changed].tolist() for name, one in courses.items()}
+        yield NextTest(hours, hold_min, over_s / 3600.0, now, later, open_um, minutes.tolist(), levels, units)
 
 
 def _course(seconds: Array, hold_min: float, rng: np.random.Generator) -> Array:

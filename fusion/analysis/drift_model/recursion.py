@@ -492,14 +492,12 @@ def make_recursion(
     skilled = [k for k in range(len(record.channels)) if held_out[k] < before[k]]
     if not skilled or not columns:
         raise RecursionError("no displacement of the hold-out set is predicted better than by its last value")
-    told.append(
+    told += [
         "each displacement responds to every sensor and driver at once and with time constants of up to "
         f"{BASELINE_LAGS_MIN[-1]:g} min, whatever the report names: error on the hold-out set from the last values before it "
-        f"{float(known_mean(held_out)):.3g} um; the report's headline model, which is not started there, {loop.rmse_final_um:.3g} um"
-    )
-    told.append(
-        f"uncertainties hold for about {part_s(record) / 3600.0:.2g} h after a zero: what no reading shows wanders on, and needs a new zero"
-    )
+        f"{float(known_mean(held_out)):.3g} um; the report's headline model, which is not started there, {loop.rmse_final_um:.3g} um",
+        f"uncertainties hold for about {part_s(record) / 3600.0:.2g} h after a zero: what no reading shows goes on, and needs a new zero",
+    ]
     told += [
         f"no correction of {name}: its hold-out set is predicted no better than by its last value"
         for k, name in enumerate(record.channels)
@@ -549,13 +547,9 @@ def expected_um(responses: Sequence[Response], record: Record, values: Array, ov
     """
     blocks = max(round(over_s / record.block_s), 1)
     asked = values - values[np.arange(len(values)) // blocks * blocks]
-    return np.sqrt(
-        [
-            np.mean(np.sum((asked @ one.covariance) * asked, axis=1))
-            + one.noise_um**2 * (2.0 + one.ratio * over_s / 2.0)
-            for one in responses
-        ]
-    )
+    opened = np.array([np.mean(np.sum((asked @ one.covariance) * asked, axis=1)) for one in responses])
+    rest = np.array([one.noise_um**2 * (2.0 + one.ratio * over_s / 2.0) for one in responses])
+    return np.sqrt(opened + rest)
 
 
 def part_s(record: Record) -> float:
@@ -595,14 +589,14 @@ def sensor_curve(
     asked, numbers = [], range(len(parts))
     for out in numbers:
         others = [parts[k] for k in numbers if k != out]
-        asked.append([_misfits(others, parts[out], used) for used in _used_columns(_path(others, reads), reads)])
+        asked.append([_misfits(others, parts[out], _used(kept, reads)) for kept in _path(others, reads)])
     # (parts, sizes, channels), and as many readings (parts, 1, channels).
     squares, free = np.array(asked), np.array([[[plain.free for _, plain in part]] for part in parts])
 
-    def ratios(kept: Sequence[int]) -> tuple[Array, Array]:
+    def ratios(some: Sequence[int]) -> tuple[Array, Array]:
         # A displacement that these parts do not hold says nothing.
         with np.errstate(invalid="ignore"):
-            by_channel = np.sqrt(np.maximum(squares[kept].sum(axis=0), 0.0) / free[kept].sum(axis=0))
+            by_channel = np.sqrt(np.maximum(squares[some].sum(axis=0), 0.0) / free[some].sum(axis=0))
         rms = known_mean(by_channel, axis=1)
         # Displacements that do not move are predicted exactly with any sensors.
         return rms, rms / max(float(rms[0]), np.finfo(float).tiny)
@@ -611,8 +605,8 @@ def sensor_curve(
     without = np.array([ratios([k for k in numbers if k != out])[1] for out in numbers])
     ratio_u = np.sqrt((len(parts) - 1) * without.var(axis=0))
     curve, later_um = [], []
-    for cross_um, taken in zip(cross, _path(parts, reads), strict=True):
-        sensors = [name for k, name in enumerate(record.sensors) if k not in taken]
+    for cross_um, kept in zip(cross, _path(parts, reads), strict=True):
+        sensors = np.array(record.sensors)[kept].tolist()
         fewer = columns_of(record, sensors)
         laid = evaluate_columns(record, fewer)
         following = follow(record, fewer, laid, events, train)
@@ -632,8 +626,7 @@ def _marginals(
     course = record.displacement[:, channel]
     here = part & np.isfinite(course)
     if not here.any():
-        p = values.shape[1]
-        nothing = Marginal(0.0, np.zeros(p), np.zeros((p, p)), 0.0, 0)
+        nothing = Marginal(0.0, np.zeros(values.shape[1]), np.zeros((values.shape[1],) * 2), 0.0, 0)
         return nothing, nothing
     constants = _constants(record, events[..., channel], here)
     scaled = values[here] * one.prior_u
@@ -648,8 +641,8 @@ def _marginals(
 _Part = Sequence[tuple[Marginal, Marginal]]
 
 
-def _path(parts: Sequence[_Part], reads: NDArray[np.bool_]) -> list[tuple[int, ...]]:
-    """Return the sensors that are taken away, none first, then one more each time; `reads` (sensors, columns) says what reads which."""
+def _path(parts: Sequence[_Part], reads: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Return the sensors that are kept, all first, then one less each time; `reads` (sensors, columns) says what reads which."""
     grams = [np.sum([part[k][0].gram for part in parts], axis=0) for k in range(len(parts[0]))]
     moments = [np.sum([part[k][0].moment for part in parts], axis=0) for k in range(len(parts[0]))]
 
@@ -660,18 +653,18 @@ def _path(parts: Sequence[_Part], reads: NDArray[np.bool_]) -> list[tuple[int, .
             total += float(moment[used] @ np.linalg.solve(precision, moment[used]) - np.linalg.slogdet(precision)[1])
         return total
 
-    path: list[tuple[int, ...]] = [()]
+    path = [np.ones(len(reads), bool)]
     while True:
-        fewer = [(*path[-1], k) for k in range(len(reads)) if k not in path[-1]]
-        tried = [(taken, used) for taken, used in zip(fewer, _used_columns(fewer, reads), strict=True) if used.any()]
+        fewer = [path[-1] & (np.arange(len(reads)) != k) for k in np.flatnonzero(path[-1])]
+        tried = [kept for kept in fewer if _used(kept, reads).any()]
         if not tried:
             return path
-        path.append(max(tried, key=lambda one: evidence(one[1]))[0])
+        path.append(max(tried, key=lambda kept: evidence(_used(kept, reads))))
 
 
-def _used_columns(path: Sequence[tuple[int, ...]], reads: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Return the columns that need none of the sensors taken away."""
-    return [np.asarray(~reads[list(taken)].any(axis=0), bool) for taken in path]
+def _used(kept: NDArray[np.bool_], reads: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the columns that need none of the sensors that are not kept."""
+    return np.asarray(~reads[~kept].any(axis=0), bool)
 
 
 def _misfits(others: Sequence[_Part], asked: _Part, used: NDArray[np.bool_]) -> list[float]:

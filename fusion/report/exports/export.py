@@ -71,33 +71,19 @@ def _moves(anomaly: AnomalyPart) -> bool:
 _DRAWS, _SEED = 400, 20260309
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """The axis without and with a compensation table, free of drift: E of ISO 230-2, the range of mean deviations of both approaches.
+def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> dict[str, float]:
+    """Return what the header says of a control that interpolates linearly between the points of a table, free of drift, um.
 
-    Attributes
-    ----------
-    before_um : without the table
-    own_um : what the table leaves of the profile that it was made from: what its points and the control's model cannot follow
-    resampling_um : largest departure, at a target, of the table's straight lines from the profile
-    value_u_um : largest standard uncertainty of a value of the table within the targets
+    E of ISO 230-2 without the table (`before_um`), what it leaves of its own profile (`own_um`), the largest departure of its lines
+    from the profile at a target (`resampling_um`), and the largest standard uncertainty of a value (`value_u_um`).
     """
-
-    before_um: float
-    own_um: float
-    resampling_um: float
-    value_u_um: float
-
-
-def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> Prediction:
-    """Predict what a control leaves that interpolates linearly between the points of a table."""
     relative = profile.deviation_um - np.interp(table.reference_mm, profile.position_mm, profile.deviation_um[0])
-    return Prediction(
-        before_um=float(np.ptp(profile.deviation_um)),
-        own_um=float(np.ptp(remainder_um(profile, table, one_table=one_table))),
-        resampling_um=float(np.abs(relative - table.added_um(profile.position_mm, one_table=False)).max()),
-        value_u_um=float(table.u_um.max()),
-    )
+    return {
+        "before_um": float(np.ptp(profile.deviation_um)),
+        "own_um": float(np.ptp(remainder_um(profile, table, one_table=one_table))),
+        "resampling_um": float(np.abs(relative - table.added_um(profile.position_mm, one_table=False)).max()),
+        "value_u_um": float(table.u_um.max()),
+    }
 
 
 def predict_test(

@@ -280,8 +280,8 @@ def test_what_does_not_suit_is_refused(small_run):
 def test_a_table_at_the_targets_leaves_only_the_errors_of_measurement(small_run):
     profile = read_profile(read_dataset(small_run / "deviations.nc"))
     prediction = predict(profile, tabulate(profile), one_table=False)
-    assert prediction.own_um < 1e-9 and prediction.resampling_um < 1e-9
-    assert prediction.before_um == pytest.approx(np.ptp(profile.deviation_um))
+    assert prediction["own_um"] < 1e-9 and prediction["resampling_um"] < 1e-9
+    assert prediction["before_um"] == pytest.approx(np.ptp(profile.deviation_um))
 
 
 def test_a_test_with_a_table_has_the_errors_of_the_table_and_its_own():
@@ -343,7 +343,7 @@ def test_scatter_of_few_cycles_is_drawn_together_where_it_differs_by_chance(smal
 def test_a_coarse_table_leaves_more_and_says_so(small_run):
     profile = read_profile(read_dataset(small_run / "deviations.nc"))
     coarse = predict(profile, tabulate(profile, spacing_mm=60.0), one_table=False)
-    assert coarse.resampling_um > 0.5 and coarse.own_um > 0.5
+    assert coarse["resampling_um"] > 0.5 and coarse["own_um"] > 0.5
 
 
 def line_of(folder):
