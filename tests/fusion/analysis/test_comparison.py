@@ -63,7 +63,7 @@ def test_of_two_sound_campaigns_nothing_changed(before: Path, tmp_path: Path) ->
 
 def test_a_repair_is_found_among_three_campaigns(before: Path, tmp_path: Path) -> None:
     sound = write_results(tmp_path / "sound", readings_of(32))
-    after = write_results(tmp_path / "after", repaired(readings_of(33), -1.2))
+    after = write_results(tmp_path / "after", repaired(readings_of(34), -1.2))
     first, second = compare_campaigns([before, sound, after])
     assert changed(first.changes) == []
     assert changed(second.changes) == [("position", REPAIRED_MM)]
