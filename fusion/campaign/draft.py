@@ -95,8 +95,8 @@ _PLACES = ("pixels", "fiducials")
 _NOT_USED = "# Files in this folder that are not used:"
 #: Kinds that no campaign reads.
 _NO_INPUT = (Kind.CAMPAIGN, Kind.RECIPE, Kind.PRODUCT)
-#: Values above this are kelvins and no temperatures of a machine table in degC.
-_WARMEST_DEGC = 150.0
+#: Values above this are kelvins and no temperatures of a machine table in degC, and above the other they may be in degF.
+_WARMEST_DEGC, _COLDEST_DEGF = 150.0, 45.0
 #: The name of an axis as a word of its own, and the line of a header that holds it: its heading, or the channel of an ecmc log's targets.
 _AXIS = re.compile(r"(?<![^\W_])([XYZABC]\d?|[UVW])(?:[-_ ]?ax[ei]s?|[-_ ]?achse)?(?![^\W_])", re.IGNORECASE)
 _AXIS_LINE = re.compile(r"^\W*(?:axis|axe|achse|TGT_SET_PV)\b.*", re.IGNORECASE | re.MULTILINE)
@@ -303,8 +303,11 @@ def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterato
     if values.dtype.kind in "iu":
         yield _line(known["scale"], TO_FILL)
     if not contents.unit:
-        guess = "K" if np.nanmedian(values) > _WARMEST_DEGC else "degC"
-        yield f"unit = {_quoted(asker.choice('Unit of the temperatures', tuple(sorted(('degC', 'K'), key=guess.__ne__))))}"
+        middle = float(np.nanmedian(values))
+        units = tuple(sorted(("degC", "K"), key=("K" if middle > _WARMEST_DEGC else "degC").__ne__))
+        in_doubt = asker.ask is None and _COLDEST_DEGF < middle <= _WARMEST_DEGC
+        unit = TO_FILL if in_doubt else asker.choice("Unit of the temperatures", units)
+        yield f"unit = {_quoted(unit)}   # of °F: degC with scale = 0.5556, offset = -17.78"
     if contents.times is None and (contents.frames > 1 or len(content.frame_files) > 1):
         pattern = _time_in_name(first.name)
         if pattern:

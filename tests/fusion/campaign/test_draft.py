@@ -206,6 +206,20 @@ def test_what_frames_of_another_camera_do_not_tell_is_marked(tmp_path):
         assert f"\n{line}" in text
 
 
+@pytest.mark.parametrize(
+    ("shape", "level", "expected"),
+    [
+        ((30, 40, 50), 22.0, ('axes = "FILL IN"', 'unit = "degC"')),  # 40 x 50 and 30 x 40 are pictures
+        ((5, 24, 32), 71.6, ('unit = "FILL IN"', 'start = "FILL IN"')),  # 22 degC in degF
+        ((24, 33, 200), 295.0, ('unit = "K"', 'interval = "FILL IN"')),  # 33 x 200 is no picture
+    ],
+)
+def test_axes_and_units_that_frames_do_not_tell_are_asked(tmp_path, shape, level, expected):
+    np.save(tmp_path / "a.npy", np.full(shape, level))
+    text = "\n".join(draft_lines(scan_folder(tmp_path), Asker(None)))
+    assert all(f"\n{line}" in text for line in expected)
+
+
 def test_laser_tests_of_one_folder_become_a_campaign_each_and_questions_are_asked_once(tmp_path):
     laser = write_laser(tmp_path.with_name("written"), 5, 4).with_name("laser.csv")
     for axis in ("x", "y", "other"):

@@ -428,6 +428,51 @@ def test_what_the_options_must_say_is_asked_for(tmp_path):
         index_recordings([tmp_path / "a.npy"], StackOptions(unit="K"))
 
 
+@pytest.mark.parametrize(
+    ("heading", "unit", "time"),
+    [
+        ("Temperature [K]", "K", None),
+        ("[Settings]\nTempUnit=°C\nRecDate=05.03.2024\nRecTime=11:00:00\n[Data]", "degC", "2024-03-05T11:00:00"),
+        ("Emissivity:;0.95\nRefl. temp:;20.0 °C", "", None),
+    ],
+)
+def test_unit_and_time_of_a_text_stand_above_its_numbers(tmp_path, heading, unit, time):
+    rows = "\n".join(";".join(["295.15"] * 12) for _ in range(9))
+    (tmp_path / "a.csv").write_bytes(f"{heading}\n{rows}\n".encode("cp1252"))
+    contents = read_stack(tmp_path / "a.csv").contents
+    assert contents.unit == unit and contents.zoned is False
+    assert contents.times == (None if time is None else (np.datetime64(time),))
+
+
+def test_a_unit_of_fahrenheit_above_the_numbers_is_refused(tmp_path):
+    rows = "\n".join(";".join(["72.5"] * 12) for _ in range(9))
+    (tmp_path / "a.csv").write_text(f"TempUnit=°F\n{rows}\n")
+    with pytest.raises(ThermographyError, match="°F; export °C or K"):
+        read_stack(tmp_path / "a.csv")
+
+
+def test_elapsed_times_of_a_store_need_the_time_of_the_first_frame_alone(tmp_path):
+    hours = ("time", np.array([0.0, 0.25, 1.5]), {"units": "hours"})
+    frames = (("time", "y", "x"), np.full((3, 9, 12), 20.0), {"units": "degC"})
+    xr.Dataset({"t": frames}, coords={"time": hours}).to_netcdf(tmp_path / "a.nc")
+    start = np.datetime64("2026-03-09T06:30")
+    frames, rejected = index_recordings([tmp_path / "a.nc"], StackOptions(start=start))
+    assert not rejected
+    assert [one.time for one in frames] == [start + np.timedelta64(minutes, "m") for minutes in (0, 15, 90)]
+
+
+@pytest.mark.parametrize(("axes", "count"), [(None, 0), ("frame, row, column", 30), ("row, column, frame", 50)])
+def test_axes_of_an_array_that_its_shape_does_not_tell_are_stated(tmp_path, axes, count):
+    np.save(tmp_path / "a.npy", np.arange(60_000.0).reshape(30, 40, 50))
+    options = StackOptions(unit="K", axes=axes, start=np.datetime64("2026-03-09"), interval_s=1.0)
+    if axes is None:
+        with pytest.raises(StackError, match="nothing says which axis"):
+            index_recordings([tmp_path / "a.npy"], options)
+        return
+    frames, _ = index_recordings([tmp_path / "a.npy"], options)
+    assert len(frames) == count
+
+
 def public_format(path: Path, kind: int, values: np.ndarray, *, quantity: int = 0) -> Path:
     """A file of FLIR's header fpfimg.h: offset, quantity, kind of pixels, columns and rows at 0x24, the time at 0x248."""
     head = bytearray(892)
