@@ -509,12 +509,12 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
             return (name,)
         for columns in ([name, *[two for two in days if two != name][:1]], [name]):
             written = _sample(written_times(frame, columns))
-            order = _order_of(written, asked)
+            order = _order_of(stripped(written_times(frame, columns)).tolist(), asked)
             if name in days and columns == [name]:
                 keys["time"], heading = name, f"{name} {rows.units.get(name, '')}"
                 two = all(text.count(":") == 1 for text in written) and not _HOURS_FIRST.search(heading)
                 # Less than 24 minutes would be no test.
-                if _MINUTES_FIRST.search(heading) or (two and max(elapsed_s(written)) >= 86400.0):
+                if _MINUTES_FIRST.search(heading) or (two and np.nanmax(elapsed_s(written)) >= 86400.0):
                     keys["time_format"] = "%M:%S"
                     asked |= {} if _MINUTES_FIRST.search(heading) else {"time_format": "%H:%M"}
                 return (name,)
@@ -587,7 +587,7 @@ def _place_times(heading: str, numbers: np.ndarray, known: str, keys: dict[str, 
         # Seconds that are counted go through 6000 to 9999.
         keys["time_format"], asked["time_format"] = "%H%M%S", ""
         return
-    shortest, longest = _LENGTHS_S / (numbers[-1] - numbers[0])
+    shortest, longest = _LENGTHS_S / max(float(numbers[-1] - numbers[0]), 1e-9)
     units = (unit for unit in ("s", "min", "h", "ms", "us", "ns") if shortest <= conversion(unit, "s")[0] <= longest)
     keys["time_unit"] = next(units, "h")
     asked["time_unit"] = f"{_plain(float(numbers[0]))} to {_plain(float(numbers[-1]))}"
@@ -599,7 +599,7 @@ def _order_of(texts: Sequence[str], asked: dict[str, str]) -> str:
         DateOrder.of(Path(), enumerate(texts))
         return ""
     # A clock of AM and PM without blanks is an English one, as dates with the month first are.
-    usual = "month first" if re.search(r"\d ?[AP]M", texts[0]) else "day first"
+    usual = "month first" if re.search(r"\d ?[AP]M", " ".join(texts)) else "day first"
     first, *others = sorted(closest_orders(texts), key=usual.__ne__) or [""]
     asked |= {"date_order": " or ".join(others)} if others else {}
     return first
