@@ -646,7 +646,9 @@ def _unit_in_cells(path: Path, name: str, texts: pd.Series) -> tuple[pd.Series, 
     numerals, whole = Numerals.of(part[1] for part in parts if part), find_unit(most)
     values = []
     for line, part, unit in zip(texts.index, parts, written, strict=True):
-        value, one = numerals.number(part[1]) if part else math.nan, find_unit(unit)
+        value, one = math.nan, find_unit(unit)
+        with suppress(BadReading):
+            value = numerals.number(part[1]) if part else math.nan
         if unit != most and part and (one is None or whole is None or one.kind != whole.kind):
             raise TableError(f'{path}, line {line}: the column "{name}" is in {most}, here in {unit}; write one unit')
         if unit != most and one and whole:
