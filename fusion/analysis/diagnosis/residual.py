@@ -128,10 +128,11 @@ def examine(
     share_of = readings.positions_mm / readings.span_mm
     place = np.array([share_of[np.flatnonzero(readings.targets == sites[k][0])[0]] for k in kept])
 
+    shapes = _shapes(signs, place)
     # Cycles are shuffled within each site; missing readings move along.
     test = permutation_test(
         tested,
-        lambda matrix: _statistics(matrix, signs, place),
+        lambda matrix: _statistics(matrix, shapes),
         lambda matrix: rng.permuted(matrix, axis=0),
         names=("pattern", "slow_pattern", "single_target", "direction", "direction_along_axis", "curvature"),
     )
@@ -173,21 +174,22 @@ def with_drift(remainder: Remainder, fit: DriftFit) -> Remainder:
     )
 
 
-def _statistics(matrix: Array, signs: Array, place: Array) -> Array:
-    """Six statistics that grow with structure: two of rank one, one of a single place, three of given shape over time."""
+def _shapes(signs: Array, place: Array) -> tuple[Array, ...]:
+    """Weights of the sites (sites,) in a reversal, a reversal that grows along the axis, and a curvature."""
+    basis, curved = np.column_stack([np.ones_like(place), place]), (place - place.mean()) ** 2
+    return signs, signs * (place - place.mean()), curved - basis @ np.linalg.lstsq(basis, curved, rcond=None)[0]
+
+
+def _statistics(matrix: Array, shapes: Sequence[Array]) -> Array:
+    """Six statistics that grow with structure: two of rank one, one of a single place, three of given shapes (sites,) over time."""
     filled = np.nan_to_num(matrix)
     blocks = filled[: filled.shape[0] // _BLOCK * _BLOCK].reshape(-1, _BLOCK, filled.shape[1]).mean(axis=1)
-    curved = (place - place.mean()) ** 2
-    basis = np.column_stack([np.ones_like(place), place])
-    curved = curved - basis @ np.linalg.lstsq(basis, curved, rcond=None)[0]
-    stretch = signs * (place - place.mean())
-    contrasts = [filled @ signs, filled @ stretch, filled @ curved]
     return np.array(
         [
             _largest(filled),
             _largest(blocks) if blocks.shape[0] > 1 else 0.0,
             (blocks**2).sum(axis=0).max() if blocks.shape[0] > 1 else 0.0,
-            *(_slowness(contrast) for contrast in contrasts),
+            *(_slowness(filled @ shape) for shape in shapes),
         ]
     )
 

@@ -55,11 +55,12 @@ def test_planted_pattern_is_found_where_it_acts(switched):
 
 def test_the_noise_is_tested_in_units_of_its_own_and_each_site_alike(complete, monkeypatch):
     readings, fit = complete.readings, complete.fit
-    seen, statistics = [], module._statistics
+    seen, statistics, sites, shapes = [], module._statistics, [], module._shapes
     monkeypatch.setattr(module, "_statistics", lambda *given: seen.append(given) or statistics(*given))
+    monkeypatch.setattr(module, "_shapes", lambda *given: sites.append(given) or shapes(*given))
     remainder = remainder_of(complete)
     # The null is made first; the residual itself is the last that is looked at.
-    matrix, signs, place = seen[-1]
+    matrix, (signs, place) = seen[-1][0], sites[-1]
     noise, share = fit.noise()
     for k in (0, 1, matrix.shape[1] - 1):
         at = (readings.target == remainder.sites[k][0]) & ((readings.sign > 0) == (remainder.sites[k][1] == "positive"))
@@ -81,7 +82,7 @@ def test_statistics_of_patterns_that_are_known():
     place = np.repeat([0.0, 1.0, 2.0, 3.0], 2) / 3.0
     signs = np.tile([1.0, -1.0], 4)
     time = np.repeat([1.0, -1.0], 5)
-    even = module._statistics(np.outer(time, np.ones(8)), signs, place)
+    even = module._statistics(np.outer(time, np.ones(8)), module._shapes(signs, place))
     # Sum of squares 80; means over blocks of five cycles leave 16, of which 2 at one site.
     np.testing.assert_allclose(even[:3], [np.sqrt(80.0), 4.0, 2.0])
     # Beside a little alternation of every shape, each slow shape shows in its own statistic; offset and line show in none.
@@ -96,10 +97,10 @@ def test_statistics_of_patterns_that_are_known():
         (bent, [quick, quick, slow]),
     ):
         np.testing.assert_allclose(
-            module._statistics(np.outer(time, shape) + little, signs, place)[3:], expected, atol=1e-3
+            module._statistics(np.outer(time, shape) + little, module._shapes(signs, place))[3:], expected, atol=1e-3
         )
     # Fewer cycles than two blocks have no slow pattern.
-    np.testing.assert_array_equal(module._statistics(np.outer(time[:9], signs), signs, place)[1:3], 0.0)
+    np.testing.assert_array_equal(module._statistics(np.outer(time[:9], signs), module._shapes(signs, place))[1:3], 0.0)
 
 
 def test_offset_and_stretch_of_every_cycle_are_taken_out_and_nothing_else(rng):
