@@ -73,8 +73,8 @@ def next_tests(folder: Path, largest: Sequence[str], *, seed: int) -> list[NextT
         )
     product = read_product(folder, "record")
     units = dict(zip(product["driver_name"].values.tolist(), product["driver_units"].values.tolist(), strict=True))
-    levels = dict(_level(text, units) for text in largest)
-    return list(propose_tests(product, results.loop, largest=levels, seed=seed))
+    levels = (_level(text, units) for text in largest)
+    return list(propose_tests(product, results.loop, largest=dict(levels), seed=seed))
 
 
 def next_test_lines(tests: Sequence[NextTest]) -> list[str]:
@@ -89,10 +89,7 @@ def next_test_lines(tests: Sequence[NextTest]) -> list[str]:
     return [
         f"standard uncertainty of a prediction under another duty, over {first.over_h:.2g} h after a zero: {sizes(first.now_um)}; least "
         f"known by itself: {sizes(first.open_um, _NAMED)}",
-        *(
-            f"after {one.hours:g} h, mean time at one level {one.hold_min:g} min: {sizes(one.after_um)}"
-            for one in tests
-        ),
+        *(f"after {one.hours:g} h, mean hold {one.hold_min:g} min: {sizes(one.after_um)}" for one in tests),
         *([nothing] if small else []),
         f"proposed: {best.hours:g} h",
         "minute  " + "  ".join(f"{name} / {unit}" for name, unit in best.units.items()),
@@ -115,10 +112,11 @@ def write_nc_program(path: Path, test: NextTest, *, control: str) -> None:
     if path.exists():
         raise DutyPlanError(f"--nc: {path} exists; name another file")
     ends, (levels,) = [*test.minutes[1:], 60.0 * test.hours], test.levels.values()
-    lines = []
-    for start, end, level in zip(test.minutes, ends, levels, strict=True):
-        lines += [f"M3 S{level:.0f}" if level > 0.0 else "M5", DWELLS[control].format(60.0 * (end - start))]
-    path.write_text("\n".join([*lines, "M5", "M30", ""]), encoding="ascii")
+    lines = [
+        f"{f'M3 S{level:.0f}' if level > 0.0 else 'M5'}\n{DWELLS[control].format(60.0 * (end - start))}\n"
+        for start, end, level in zip(test.minutes, ends, levels, strict=True)
+    ]
+    path.write_text("".join(lines) + "M5\nM30\n", encoding="ascii")
 
 
 def _level(text: str, units: Mapping[str, str]) -> tuple[str, float]:

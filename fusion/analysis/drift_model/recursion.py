@@ -470,11 +470,8 @@ def make_recursion(
             f"hold-out set {chosen.held_out_rmse:.3g} um, with all {curve[0].held_out_rmse:.3g} um"
         )
     columns, events = columns_of(record, sensors), events_of(product, loop)
-    told += [
-        f"not contained, because no reading shows it: {step.effect}"
-        for step in loop.steps
-        if step.effect not in FOLLOWED
-    ]
+    unseen = [step.effect for step in loop.steps if step.effect not in FOLLOWED]
+    told += [f"not contained, because no reading shows it: {effect}" for effect in unseen]
     values = evaluate_columns(record, columns)
 
     def missed(used: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
@@ -498,10 +495,9 @@ def make_recursion(
         f"{float(known_mean(held_out)):.3g} um; the report's headline model, which is not started there, {loop.rmse_final_um:.3g} um",
         f"uncertainties hold for about {part_s(record) / 3600.0:.2g} h after a zero: what no reading shows goes on, and needs a new zero",
     ]
+    idle = [name for k, name in enumerate(record.channels) if k not in skilled]
     told += [
-        f"no correction of {name}: its hold-out set is predicted no better than by its last value"
-        for k, name in enumerate(record.channels)
-        if k not in skilled
+        f"no correction of {name}: its hold-out set is predicted no better than by its last value" for name in idle
     ]
     whole = np.column_stack([one.coefficients for one in followed])
     inputs = _inputs(record, columns)
