@@ -896,8 +896,7 @@ def plan(
             source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed
         )
         if as_json:
-            dwell_s, rows = float(duty["mean_dwell"]), planned.switchings(duty)
-            print_json({"hours": float(duty["test_hours"]), "mean_dwell_s": dwell_s, "switchings": rows})
+            print_json({"hours": float(duty["test_hours"]), "switchings": planned.switchings(duty)})
         else:
             _print_lines(planned.duty_lines(duty, power=power))
 

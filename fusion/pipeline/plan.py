@@ -30,7 +30,6 @@ _NAMED = 4
 _WORTH_IT = 0.1
 #: A dwell in seconds by control: LinuxCNC and SINUMERIK in seconds, Fanuc in seconds where the number has a decimal point.
 DWELLS = {"linuxcnc": "G4 P{:.0f}", "siemens840d": "G4 F{:.0f}", "fanuc": "G04 X{:.1f}"}
-_SPEEDS = ("1/min", "rpm", "min-1")
 
 
 def propose_duty(
@@ -102,7 +101,7 @@ def next_test_lines(tests: Sequence[NextTest]) -> list[str]:
 
 def write_nc_program(path: Path, test: NextTest, *, control: str) -> None:
     """Write the schedule of a test as an NC program of spindle speeds and dwells, which moves no axis."""
-    if len(test.units) != 1 or next(iter(test.units.values())) not in _SPEEDS:
+    if len(test.units) != 1 or next(iter(test.units.values())) not in ("1/min", "rpm", "min-1"):
         named = ", ".join(f"{name} / {unit}" for name, unit in test.units.items())
         raise DutyPlanError(
             f"--nc: a program sets the speed of one spindle in 1/min, and this record has {named}; set the levels by hand"
