@@ -108,9 +108,9 @@ def _scatter_notices(drift: xr.Dataset | None) -> Iterator[Notice]:
         return
     yield Notice(
         "scatter_undetermined",
-        "The drift from one reading to the next is so large that the noise of the readings is negligible against it: the search for the "
-        f"variances ended at its limit. The scatter of {sigma:.2g} µm is that limit, not a measured value, and the true one may be "
-        "far smaller; uncertainties, outliers and positions that stand out rest on it.",
+        "The drift from one reading to the next is so large that the noise of the readings cannot be told from none. "
+        f"The scatter of {sigma:.2g} µm is no measured value, and the true one may be far smaller; uncertainties, outliers and positions "
+        "that stand out rest on it.",
         "Let the machine come to rest before the test, or read the positions in quicker succession; check whether the readings were "
         "averaged or smoothed before they were written.",
     )

@@ -181,7 +181,7 @@ def estimate_drift(
           residual in standard deviations, of at least that of the rounding to the ``resolution`` (um) of the readings, infinite for a gross
           outlier.
         - ``attrs``: ``state``, ``order``, ``log_likelihood`` (restricted); ``scatter_undetermined``: 1 where the noise is small against the
-          drift between readings, so that ``sigma`` and ``scatter`` are what the search for the variances was limited to, 0 elsewhere.
+          drift between readings, so that ``sigma`` and ``scatter`` could as well be far smaller, 0 elsewhere.
 
     Raises
     ------
@@ -534,7 +534,7 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
         state=str(state),
         order=int(fit.system.order),
         log_likelihood=fit.log_likelihood,
-        scatter_undetermined=int(fit.noise_at_limit),
+        scatter_undetermined=int(fit.noise_hidden),
     )
     return result
 

@@ -51,8 +51,8 @@ from thermofuse.compiled import njit
 #: noise of one reading: from a drift far below the noise to one that hides everything else. A random walk that is a hundred times the noise
 #: passes for noise itself; an integrated one stays smooth, and a good laser reads 10 nm with 100 um of drift.
 _LOG_RATIO_LIMITS: dict[Order, tuple[float, float]] = {1: (-14.0, 4.0), 2: (-14.0, 8.0)}
-#: A search that comes as near as this to a limit, decades, ended there: twice the accuracy of the search.
-_AT_LIMIT = 0.06
+#: A drift within so many decades of a limit, and a log-likelihood that is lower by less (chi-squared, 95 %), cannot be told from it.
+_NEAR_LIMIT, _AS_LIKELY = 1.5, 1.92
 #: What a search takes for minus the log-likelihood where there is no model, per decade of drift.
 _NO_MODEL = 1e20
 #: How far a search goes before it looks again, its step for a gradient, and the least drift at which it starts, decades.
@@ -132,10 +132,13 @@ class DriftFit:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def noise_at_limit(self) -> bool:
-        """Whether a drift hides the noise: its variance ended at the upper limit of the search, which then is what `sigma` rests on."""
-        log_ratio = np.log10(np.maximum(self.system.ratios, 1e-300)) - _log_ratio_unit(self.system)
-        return bool((log_ratio >= _LOG_RATIO_LIMITS[self.system.order][1] - _AT_LIMIT).any())
+    def noise_hidden(self) -> bool:
+        """Whether a drift hides the noise: that it is as large as a search allows is as likely, so that nothing tells `sigma`."""
+        limit = _log_ratio_unit(self.system) + _LOG_RATIO_LIMITS[self.system.order][1]
+        near = np.log10(np.maximum(self.system.ratios, 1e-300)) > limit - _NEAR_LIMIT
+        at_limit = replace(self.system, ratios=np.where(near, 10.0**limit, self.system.ratios))
+        problem = _Problem.of(self.response, self.design)
+        return bool(near.any()) and _log_likelihood(at_limit, problem) > self.log_likelihood - _AS_LIKELY
 
     @property
     def drift_rate(self) -> Array:
@@ -347,8 +350,13 @@ def _search(likelihood: Callable[[Array], float], start: Array, low: Array, high
     for _ in range(_MOST_BOXES):
         box = np.maximum(best - _BOX, low), np.minimum(best + _BOX, high)
         optimum = scipy.optimize.minimize(
-            with_gradient, best, jac=True, method="L-BFGS-B", bounds=[*zip(*box, strict=True)], options={"ftol": 1e-7, "gtol": 0.02}
-        )  # fmt: skip
+            with_gradient,
+            best,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[*zip(*box, strict=True)],
+            options={"ftol": 1e-7, "gtol": 0.02},
+        )
         best, before, least = optimum.x, least, optimum.fun
         at_edge = (best <= box[0]) & (box[0] > low) | (best >= box[1]) & (box[1] < high)
         if not at_edge.any() or before - least < _LEAST_RISE:
@@ -434,11 +442,17 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     limits = np.log10(span * np.array(_SETTLING_LIMITS))
     # The drift may hide everything on the way, where there is no gradient.
     optimum = scipy.optimize.minimize(
-        lambda x: -likelihood(x[:components], 10.0 ** x[-2], x[-1]), guess, method="Nelder-Mead",
+        lambda x: -likelihood(x[:components], 10.0 ** x[-2], x[-1]),
+        guess,
+        method="Nelder-Mead",
         bounds=[(None, None)] * components + [tuple(limits), (0.0, _FASTEST_SETTLING)],
-        options={"initial_simplex": np.vstack([guess, guess + np.diag([1.0] * components + [0.5, 1.0])]), "xatol": 0.03,
-                 "fatol": 1e-2, "maxfev": 80 * guess.size},
-    )  # fmt: skip
+        options={
+            "initial_simplex": np.vstack([guess, guess + np.diag([1.0] * components + [0.5, 1.0])]),
+            "xatol": 0.03,
+            "fatol": 1e-2,
+            "maxfev": 80 * guess.size,
+        },
+    )
     if -optimum.fun < constant + _SETTLING_MARGIN:
         return fit
     # By all components together: one that hardly moves may have any size.

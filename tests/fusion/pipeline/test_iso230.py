@@ -78,7 +78,11 @@ def test_what_is_stated_is_judged_and_shown():
     judged = {row.quantity: row.decision for row in part.tolerances}
     assert judged == {"A": "pass", "R": "fail", "E\u2191": "pass", "E\u2193": "pass"}
     conditions = {row.name: row.text for row in part.conditions}
-    assert conditions["Machine"] == "Mill" and conditions["Axis"] == "X" and conditions["Feed"] == "2000 mm/min"
+    assert (
+        conditions["Machine"] == "Mill"
+        and conditions["Axis"] == "X"
+        and conditions["Feed between the targets"] == "2000 mm/min"
+    )
     assert conditions["Instrument 1"] == "laser, serial number not stated, calibration not stated"
     assert conditions["Air temperature before, after"] == "21.5 \u00b0C, not stated"
     assert conditions["Operator"] == "" and conditions["Dead path"] == ""

@@ -120,7 +120,7 @@ def test_a_scatter_that_the_drift_hides_is_named_and_no_other(copied):
         row[column] = f"{value:.6f}"
     (copied / "laser.csv").write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
     (notice,) = [one for one in notices_of(copied) if one.code == "scatter_undetermined"]
-    assert "the search for the variances ended at its limit. The scatter of " in notice.message
+    assert "cannot be told from none. The scatter of " in notice.message
     assert notice.remedy.startswith("Let the machine come to rest before the test")
 
 
