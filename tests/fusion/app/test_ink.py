@@ -98,7 +98,7 @@ def test_every_chart_has_ink(app, flagged, new_page):
     # Until then the screen shows the folder's own results, which have the same parts.
     page.get_by_text("Position 3 repeats worse than the others.").wait_for()
     for part, least, shown in (
-        ("Map", 1, "Cycle 24 ("), ("Laser", 5, "Readings at"), ("Positions", 1, "Rise within"), ("Cause", 1, "Round 1"),
+        ("Map", 1, "Cycle 24 ("), ("Laser", 5, "Readings at"), ("Positions", 1, "Random scatter of every"), ("Cause", 1, "Round 1"),
     ):  # fmt: skip
         open_part(part)
         page.get_by_text(shown).first.wait_for()
