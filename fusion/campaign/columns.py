@@ -55,7 +55,7 @@ from interferometry.io.tables import (
     where_clock_goes_back,
 )
 from thermofuse.resources import by_word, vocabulary
-from thermofuse.units import SHARE
+from thermofuse.units import SHARE, find_unit
 
 _VOCABULARY = vocabulary("columns")
 
@@ -469,8 +469,10 @@ def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str,
     if not times or len(values) != 1 or not 1 < names.get(channel, 0) < len(frame) / 3:
         return {}
     asked |= open_
-    if of_units:
-        units |= dict(zip(written[channel], written[of_units[0]], strict=True))
+    for name, unit in sorted(set(zip(written[channel], written[of_units[0]], strict=True))) if of_units else ():
+        # Two units of one channel are none.
+        same = unit_name(units.get(name, unit)) == unit_name(unit)
+        units[name] = unit if same else f"{units[name]} or {unit}"
     return {"long": {"time": keys.pop("time"), "channel": channel, "value": str(values[0])}, **keys}
 
 
@@ -648,6 +650,12 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
             return replace(
                 known, role=role or ("out" if of_rest == "driver" else of_rest), unit=unit, remark=UNIT_NOT_KNOWN
             )
+        kind = getattr(find_unit(unit), "kind", "") if of_unit == "driver" and role != "driver" else ""
+        if unit == "deg" and 12.0 < float(np.median(numbers)) < 80.0 and not (numbers == np.round(numbers)).all():
+            # "Grad" and "°" alone may be degrees Celsius.
+            return replace(known, role=role or "temperature", remark=UNIT_NOT_KNOWN)
+        if kind == "angle" or unit in ("um/m", "µm/m") or (kind == "time" and _grows(series)):
+            return replace(known, remark="a time" if kind == "time" else "no load")
         if role == "displacement" and unit in _OF_SIGNALS:
             return replace(known, remark=UNIT_NOT_KNOWN)
         if role == "displacement" and '"' in heading and of_unit == "driver":

@@ -97,6 +97,8 @@ _NOT_USED = "# Files in this folder that are not used:"
 _NO_INPUT = (Kind.CAMPAIGN, Kind.RECIPE, Kind.PRODUCT)
 #: Values above this are kelvins and no temperatures of a machine table in degC, and above the other they may be in degF.
 _WARMEST_DEGC, _COLDEST_DEGF = 150.0, 45.0
+#: Kelvins of a table that are no tenths of a degree and no other count.
+_COLDEST_K, _WARMEST_K = 230.0, 400.0
 #: The name of an axis as a word of its own, and the line of a header that holds it: its heading, or the channel of an ecmc log's targets.
 _AXIS = re.compile(r"(?<![^\W_])([XYZABC]\d?|[UVW])(?:[-_ ]?ax[ei]s?|[-_ ]?achse)?(?![^\W_])", re.IGNORECASE)
 _AXIS_LINE = re.compile(r"^\W*(?:axis|axe|achse|TGT_SET_PV)\b.*", re.IGNORECASE | re.MULTILINE)
@@ -305,7 +307,10 @@ def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterato
     if not contents.unit:
         middle = float(np.nanmedian(values))
         units = tuple(sorted(("degC", "K"), key=("K" if middle > _WARMEST_DEGC else "degC").__ne__))
-        in_doubt = asker.ask is None and _COLDEST_DEGF < middle <= _WARMEST_DEGC
+        # Degrees Celsius of a table, or its kelvins; whole numbers may be tenths of either.
+        usual = middle <= _COLDEST_DEGF or _COLDEST_K < middle < _WARMEST_K
+        whole = bool((values == np.round(values))[np.isfinite(values)].all())
+        in_doubt = asker.ask is None and (not usual or whole)
         unit = TO_FILL if in_doubt else asker.choice("Unit of the temperatures", units)
         yield f"unit = {_quoted(unit)}   # of °F: degC with scale = 0.5556, offset = -17.78"
     if contents.times is None and (contents.frames > 1 or len(content.frame_files) > 1):
@@ -323,7 +328,8 @@ def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterato
 def _time_in_name(name: str) -> str:
     """Return the pattern of a date and a time of day in a name, "" where there is none."""
     found = re.search(r"(?:19|20)\d{2}([-_]?)\d{2}\1\d{2}([-_T ]+)\d{2}([-_.]?)\d{2}\3\d{2}", name)
-    if found is None:
+    # A clock of twelve hours is asked.
+    if found is None or re.match(r"[-_. ]?[AP]M", name[found.end() :], re.IGNORECASE):
         return ""
     day, between, clock = found.groups()
     return f"%Y{day}%m{day}%d{between}%H{clock}%M{clock}%S"

@@ -884,15 +884,16 @@ def _refuse_different_columns(tables: dict[Path, xr.Dataset]) -> None:
                     f"{path}: the columns differ from those of {first.name}: {differing} is not in both; all runs of a record need the "
                     "same columns, name those that all of them have"
                 )
-        units, wanted = (
+        of_drivers = (
             dict(zip(one["driver_name"].values.tolist(), one["driver_units"].values.tolist(), strict=True))
             for one in (table, reference)
         )
-        for name, unit in units.items():
-            if unit != wanted[name]:
-                raise TableError(
-                    f'{path}: the driver "{name}" is in {unit}, in {first.name} in {wanted[name]}; write it in one unit in all runs'
-                )
+        for units, wanted in (tuple(of_drivers), tuple(json.loads(one.attrs["units"]) for one in (table, reference))):
+            for name, unit in units.items():
+                if unit and (other := wanted.get(name)) and unit != other:
+                    raise TableError(
+                        f'{path}: "{name}" is in {unit}, in {first.name} in {other}; write it in one unit in all runs'
+                    )
 
 
 def _overlaps(tables: dict[Path, xr.Dataset]) -> list[str]:

@@ -337,6 +337,9 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         coords={"time": time[keep][order], "sensor": sensors, "channel": channels, "driver_name": drivers},
         attrs={
             "source": path.name,
+            "units": json.dumps(
+                {name: unit_name(rows.units.get(name, "")) for of_role in columns.values() for name in of_role}
+            ),
             "left_out": json.dumps([asdict(line) for line in left_out]),
             "clock": json.dumps([asdict(line) for line in goes_back]),
             "marks": json.dumps([asdict(line) for line in marks]),

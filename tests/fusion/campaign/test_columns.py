@@ -536,6 +536,40 @@ def test_a_unit_or_factor_that_is_not_understood_is_asked(tmp_path: Path, head: 
     assert len(missing) == len(asked) and all(name in line for name, line in zip(asked, missing, strict=True))
 
 
+def test_what_follows_a_load_and_a_second_clock_are_none_and_degrees_alone_are_asked(tmp_path: Path) -> None:
+    lines = [f"{60 * k},{20.1 + k / 100},{21.1 + k / 90},{k}.5,{k / 7},{k / 9},{k}" for k in range(100)]
+    (tmp_path / "log.csv").write_text(
+        "time [s],T1 [degC],Lager [Grad],Z [um],Strain [µm/m],tilt [arcsec],Runtime [min]\n"
+    )
+    with (tmp_path / "log.csv").open("a") as file:
+        file.write("\n".join(lines))
+    roles = {column.heading.split()[0]: column.role for column in propose_table(tmp_path / "log.csv").columns}
+    assert roles == {
+        "time": "time", "T1": "temperature", "Lager": "temperature", "Z": "displacement", "Strain": "out", "tilt": "out", "Runtime": "out",
+    }  # fmt: skip
+    _, missing = write_campaign(tmp_path, Asker(None))
+    assert len(missing) == 1 and "Lager [Grad]" in missing[0]
+
+
+def test_runs_and_channels_in_two_units_are_refused_or_asked(tmp_path: Path) -> None:
+    for name, unit, factor in (("a.csv", "um", 1.0), ("b.csv", "mm", 1e-3)):
+        hour = 8 if unit == "um" else 12
+        lines = [f"2026-03-09T{hour + k // 60:02}:{k % 60:02},{20.1 + k / 100},{factor * k}" for k in range(100)]
+        (tmp_path / name).write_text("\n".join(["time,T1,Z", f",degC,{unit}", *lines]))
+    campaign, _ = write_campaign(tmp_path, Asker(None))
+    with pytest.raises(TableError, match=r'b\.csv: "Z" is in mm, in a.csv in um'):
+        read_record(load_campaign(campaign))
+    changes = [
+        f"2026-03-09T08:{k % 60:02},{name},{value},{unit}"
+        for k in range(60)
+        for name, value, unit in (("T1", 20.1 + k / 100, "degC"), ("Z", k, "um" if k < 30 else "nm"))
+    ]
+    (tmp_path / "long").mkdir()
+    (tmp_path / "long/a.csv").write_text("\n".join(["time,channel,value,unit", *changes]))
+    _, missing = write_campaign(tmp_path / "long", Asker(None))
+    assert len(missing) == 1 and "nm or um" in missing[0]
+
+
 @pytest.mark.parametrize(
     ("head", "line"),
     [

@@ -202,16 +202,23 @@ def test_frames_of_another_camera_are_ready_with_their_times_from_the_names(copi
 def test_what_frames_of_another_camera_do_not_tell_is_marked(tmp_path):
     np.save(tmp_path / "a.npy", np.full((2, 8, 9), 7329, np.uint16))
     text = "\n".join(draft_lines(scan_folder(tmp_path), Asker(None)))
-    for line in ('frames = ["*.npy"]', 'scale = "FILL IN"', 'unit = "K"', 'start = "FILL IN"', 'interval = "FILL IN"'):
+    for line in (
+        'frames = ["*.npy"]',
+        'scale = "FILL IN"',
+        'unit = "FILL IN"',
+        'start = "FILL IN"',
+        'interval = "FILL IN"',
+    ):
         assert f"\n{line}" in text
 
 
 @pytest.mark.parametrize(
     ("shape", "level", "expected"),
     [
-        ((30, 40, 50), 22.0, ('axes = "FILL IN"', 'unit = "degC"')),  # 40 x 50 and 30 x 40 are pictures
+        ((30, 40, 50), 22.3, ('axes = "FILL IN"', 'unit = "degC"')),  # 40 x 50 and 30 x 40 are pictures
         ((5, 24, 32), 71.6, ('unit = "FILL IN"', 'start = "FILL IN"')),  # 22 degC in degF
-        ((24, 33, 200), 295.0, ('unit = "K"', 'interval = "FILL IN"')),  # 33 x 200 is no picture
+        ((5, 24, 32), 219.0, ('unit = "FILL IN"',)),  # 21.9 degC in tenths
+        ((24, 33, 200), 295.2, ('unit = "K"', 'interval = "FILL IN"')),  # 33 x 200 is no picture
     ],
 )
 def test_axes_and_units_that_frames_do_not_tell_are_asked(tmp_path, shape, level, expected):

@@ -458,7 +458,7 @@ def test_runs_that_are_named_wrongly_are_refused(tmp_path: Path, runs: str, mess
     ("other", "message"),
     [
         (stamped(2, heading="time,t1 [degC],ch2 [um],speed [rpm]"), "ch1, ch2 is not in both"),
-        (stamped(2, heading="time,t1 [degC],ch1 [um],speed [1/s]"), 'the driver "speed" is in 1/s, in a.csv in'),
+        (stamped(2, heading="time,t1 [degC],ch1 [um],speed [1/s]"), '"speed" is in 1/s, in a.csv in rpm'),
         (stamped(1, hours=9), "begins at 2026-01-01T06:00:00, before .* has ended"),
     ],
 )
