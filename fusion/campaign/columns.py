@@ -519,6 +519,9 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
                 if _MINUTES_FIRST.search(heading) or (two and np.nanmax(elapsed_s(written)) >= 86400.0):
                     keys["time_format"] = "%M:%S"
                     asked |= {} if _MINUTES_FIRST.search(heading) else {"time_format": "%H:%M"}
+                elif two and elapsed_s(written)[0] == 0.0:
+                    # Counted from zero, either; a time of day begins elsewhere.
+                    keys["time_format"], asked["time_format"] = "%H:%M", "%M:%S"
                 return (name,)
             if _mostly([_is_read(text, DateOrder(order)) for text in written]):
                 keys |= {"time": columns if len(columns) > 1 else name} | ({"date_order": order} if order else {})
