@@ -471,8 +471,8 @@ def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str,
     asked |= open_
     for name, unit in sorted(set(zip(written[channel], written[of_units[0]], strict=True))) if of_units else ():
         # Two units of one channel are none.
-        same = unit_name(units.get(name, unit)) == unit_name(unit)
-        units[name] = unit if same else f"{units[name]} or {unit}"
+        if unit and unit_name(units.setdefault(name, unit)) != unit_name(unit):
+            units[name] += f" or {unit}"
     return {"long": {"time": keys.pop("time"), "channel": channel, "value": str(values[0])}, **keys}
 
 
@@ -638,6 +638,7 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         return Column(heading, "out", unit, first, remark=_NO_NUMBERS)
     low, high = float(numbers.min()), float(numbers.max())
     known = Column(heading, "out", unit, first, low, high, told=told)
+    warm = 12.0 < float(np.median(numbers)) < 80.0 and not (numbers == np.round(numbers)).all()
     word, role = _word(name)
     if role == "setpoint":
         # What is commanded acts as a load does; a commanded position does not.
@@ -653,8 +654,9 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
             return replace(
                 known, role=role or ("out" if of_rest == "driver" else of_rest), unit=unit, remark=UNIT_NOT_KNOWN
             )
-        kind = getattr(find_unit(unit), "kind", "") if of_unit == "driver" and role != "driver" else ""
-        if unit == "deg" and 12.0 < float(np.median(numbers)) < 80.0 and not (numbers == np.round(numbers)).all():
+        found = find_unit(unit) if of_unit == "driver" and role != "driver" else None
+        kind = found.kind if found is not None else ""
+        if unit == "deg" and kind and warm:
             # "Grad" and "°" alone may be degrees Celsius.
             return replace(known, role=role or "temperature", remark=UNIT_NOT_KNOWN)
         if kind == "angle" or unit in ("um/m", "µm/m") or (kind == "time" and _grows(series)):
@@ -675,8 +677,6 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         return replace(known, remark="constant")
     if role == "driver":
         return replace(known, role=role, unit=_UNIT_OF_WORD.get(word, "1"))
-    typical = float(np.median(numbers))
-    warm = 12.0 < typical < 80.0 and not (numbers == np.round(numbers)).all()
     if role == "temperature" or (role == "" and warm and _says_nothing(name)):
         unit, remark = _usual_unit("temperature", known)
         return replace(known, role="temperature", unit=unit, remark=remark if role else _BY_VALUES)

@@ -329,7 +329,7 @@ def _time_in_name(name: str) -> str:
     """Return the pattern of a date and a time of day in a name, "" where there is none."""
     found = re.search(r"(?:19|20)\d{2}([-_]?)\d{2}\1\d{2}([-_T ]+)\d{2}([-_.]?)\d{2}\3\d{2}", name)
     # A clock of twelve hours is asked.
-    if found is None or re.match(r"[-_. ]?[AP]M", name[found.end() :], re.IGNORECASE):
+    if found is None or re.match(r"[-_. ]?[AP]M(?![A-Z])", name[found.end() :], re.IGNORECASE):
         return ""
     day, between, clock = found.groups()
     return f"%Y{day}%m{day}%d{between}%H{clock}%M{clock}%S"

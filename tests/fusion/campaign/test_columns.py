@@ -562,7 +562,7 @@ def test_runs_and_channels_in_two_units_are_refused_or_asked(tmp_path: Path) -> 
     changes = [
         f"2026-03-09T08:{k % 60:02},{name},{value},{unit}"
         for k in range(60)
-        for name, value, unit in (("T1", 20.1 + k / 100, "degC"), ("Z", k, "um" if k < 30 else "nm"))
+        for name, value, unit in (("T1", 20.1 + k / 100, "degC" if k else ""), ("Z", k, "um" if k < 30 else "nm"))
     ]
     (tmp_path / "long").mkdir()
     (tmp_path / "long/a.csv").write_text("\n".join(["time,channel,value,unit", *changes]))
