@@ -136,9 +136,11 @@ class DriftFit:
         """Whether a drift hides the noise: that it is as large as a search allows is as likely, so that nothing tells `sigma`."""
         limit = _log_ratio_unit(self.system) + _LOG_RATIO_LIMITS[self.system.order][1]
         near = np.log10(np.maximum(self.system.ratios, 1e-300)) > limit - _NEAR_LIMIT
+        if not near.any():
+            return False
         at_limit = replace(self.system, ratios=np.where(near, 10.0**limit, self.system.ratios))
-        problem = _Problem.of(self.response, self.design)
-        return bool(near.any()) and _log_likelihood(at_limit, problem) > self.log_likelihood - _AS_LIKELY
+        likelihood = _log_likelihood(at_limit, _Problem.of(self.response, self.design))
+        return likelihood > self.log_likelihood - _AS_LIKELY
 
     @property
     def drift_rate(self) -> Array:

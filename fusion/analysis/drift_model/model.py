@@ -309,17 +309,26 @@ def _growth(readings: Readings, fit: DriftFit) -> Array:
     """Relative variance of each reading from noise that grows or falls over the test, (n,), mean 1; ones where none is significant."""
     noise, share = fit.noise()
     ordinary = fit.system.variance == 1.0
-    cycles, cycle = np.unique(readings.cycle[ordinary], return_inverse=True)
-    if cycles.size < _FEWEST_CYCLES:
+    if np.unique(readings.cycle[ordinary]).size < _FEWEST_CYCLES:
         return np.ones(noise.size)
-    squares, expected = (np.bincount(cycle, values[ordinary]) for values in ((noise / fit.sigma) ** 2, share))
-    place = (cycles - cycles.mean()) / np.ptp(cycles)
-    logarithm = np.log(np.maximum(squares, 1e-12) / expected)
-    (slope, _), covariance = np.polyfit(place, logarithm, 1, cov=True)
-    if abs(slope) < _LEAST_GROWTH * np.sqrt(covariance[0, 0]):
+    squares = (noise / fit.sigma) ** 2
+    slope, variance, middle = noise_growth(readings.cycle[ordinary], squares[ordinary], share[ordinary])
+    if abs(slope) < _LEAST_GROWTH * np.sqrt(variance):
         return np.ones(noise.size)
-    relative = np.exp(slope * (readings.cycle - cycles.mean()) / np.ptp(cycles))
+    relative = np.exp(slope * (readings.cycle - middle))
     return np.asarray(relative / relative.mean())
+
+
+def noise_growth(cycle: NDArray[np.int64], squares: Array, share: Array) -> tuple[float, float, float]:
+    """Slope per cycle of the logarithm of the noise's variance, from the squares of its readings (n,) and the share of it that each shows,
+    with the variance of that slope and the middle of the cycles.
+    """
+    cycles, place = np.unique(cycle, return_inverse=True)
+    of_cycle, expected = (np.bincount(place, each) for each in (squares, share))
+    middle = float(cycles.mean())
+    logarithm = np.log(np.maximum(of_cycle, 1e-12) / expected)
+    (slope, _), covariance = np.polyfit(cycles - middle, logarithm, 1, cov=True)
+    return float(slope), float(covariance[0, 0]), middle
 
 
 #: How often errors of the camera and the declared coefficients are sized in turn.

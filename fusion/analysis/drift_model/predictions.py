@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import Readings, known_mean
-from fusion.analysis.drift_model.model import ModelFit
+from fusion.analysis.drift_model.model import ModelFit, noise_growth
 from fusion.analysis.drift_model.null_simulation import rank_p_value, simulate_null
 from fusion.analysis.drift_model.record_data import Record
 from fusion.analysis.effects.events import cycle_starts
@@ -98,16 +98,14 @@ def _growth_ahead(
     """Relative variance (n,) to which noise (n_used,) grows from the mean of the training part, as far as that stands out, and factors
     (draws,) on what comes then, for what so many readings leave unknown of it.
     """
-    cycles, of_used = np.unique(cycle[used], return_inverse=True)
-    squares = np.bincount(of_used, noise**2) / np.bincount(of_used)
     relative, spread = np.ones(cycle.size), 0.0
-    if cycles.size > _FEWEST_FOR_GROWTH and squares.all():
-        (slope, _), covariance = np.polyfit(cycles - cycles.mean(), np.log(squares), 1, cov=True)
+    if np.unique(cycle[used]).size > _FEWEST_FOR_GROWTH:
+        slope, variance, middle = noise_growth(cycle[used], noise**2, np.ones(noise.size))
         # James and Stein's estimate, its positive part, and what it leaves of the uncertainty.
-        kept = max(0.0, 1.0 - covariance[0, 0] / slope**2)
-        relative = np.exp(kept * slope * (cycle - cycles.mean()))
+        kept = max(0.0, 1.0 - variance / slope**2) if slope else 0.0
+        relative = np.exp(kept * slope * (cycle - middle))
         relative /= relative[used].mean()
-        spread = np.sqrt(kept * covariance[0, 0]) * (cycle[~used].mean() - cycles.mean()) / 2.0
+        spread = np.sqrt(kept * variance) * (cycle[~used].mean() - middle) / 2.0
     again = np.mean(rng.choice(noise, (noise.size, _DRAWS)) ** 2, axis=0) / np.mean(noise**2)
     return relative, np.sqrt(again) * np.exp(spread * rng.standard_normal(_DRAWS))
 
