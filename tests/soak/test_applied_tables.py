@@ -38,16 +38,30 @@ def axis(rng: np.random.Generator) -> Array:
 
 
 def measure(
-    rng: np.random.Generator, profile: Array, *, cycles: int, drift_um: float, noise: np.random.Generator | None = None
+    rng: np.random.Generator,
+    profile: Array,
+    *,
+    cycles: int,
+    drift_um: float,
+    state: tuple[float, float, float] = (1.0, 1.0, 0.0),
+    noise: np.random.Generator | None = None,
 ):
     """A test: both approaches of every cycle; shift and stretch of its own warm-up, and noise of the same generator or another one."""
     order = np.concatenate([np.arange(16), np.arange(31, 15, -1)]).reshape(2, -1)
     order[1] = 31 - np.arange(16)
     seconds = 300.0 * np.arange(cycles)[:, None, None] + 8.0 * order
-    state = 1.0 - np.exp(-seconds / rng.uniform(1500.0, 6000.0))
-    shift, stretch = drift_um * rng.standard_normal(2)
-    drift = state * (shift + stretch * POSITION / 300.0)
+    share, of_time, begun = state
+    reached = 1.0 - (1.0 - begun) * np.exp(-seconds / (of_time * rng.uniform(1500.0, 6000.0)))
+    shift, stretch = share * drift_um * rng.standard_normal(2)
+    drift = reached * (shift + stretch * POSITION / 300.0)
     return deviations_of(seconds, POSITION, profile + drift + NOISE_UM * (noise or rng).standard_normal(seconds.shape))
+
+
+def an_old_table(rng: np.random.Generator, errors: Array) -> ActiveTable:
+    """A table of what the axis had once, which is not what it has now."""
+    at, once = np.arange(-10.0, 311.0, 16.0), errors + np.cumsum(rng.normal(0.0, 0.5, (2, 16)), axis=1)
+    old = np.array([np.interp(at, POSITION, one) for one in once])
+    return ActiveTable("old.comp", at, old - old[0, 0])
 
 
 FAULTS = {
@@ -112,33 +126,56 @@ def test_right_tables_and_planted_faults(cycles: int, drift_um: float) -> None:
     assert sum(named.values()) >= 0.95 * RUNS * len(FAULTS)
 
 
+#: Of a second test: the share of the drift and of its time constant, and the share of it that is there at the start.
+STATES = {
+    "the same": (1.0, 1.0, 0.0),
+    "half the duty": (0.5, 0.5, 0.0),
+    "after a stop": (1.0, 1.0, 0.3),
+    "warm": (1.0, 1.0, 0.7),
+}
+
+
+@pytest.mark.parametrize("active", [False, True], ids=["alone", "added to an active table"])
 @pytest.mark.parametrize("one_table", [False, True])
+@pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize(("cycles", "drift_um"), [(5, 0.3), (5, 1.4), (10, 2.0)])
-def test_a_test_in_the_same_thermal_state_is_as_predicted(cycles: int, drift_um: float, one_table: bool) -> None:
-    """A window of five cycles of a test with the same warm-up; of a control of one table an axis of constant reversal."""
+def test_a_test_with_the_table_is_as_predicted(
+    cycles: int, drift_um: float, state: str, one_table: bool, active: bool
+) -> None:
+    """A window of five cycles of a second test; of a control of one table an axis of constant reversal.
+
+    Predicted is a test in the thermal state of the first. A camera changes nothing: a table is made from the readings of the laser.
+    """
     off: dict[str, list[float]] = {symbol: [] for symbol in "AEMB"}
     for run in range(RUNS):
         rng = np.random.default_rng(first_seed(5400) + run)
         profile, seed = axis(rng), int(rng.integers(1 << 30))
         if one_table:
             profile = profile.mean(axis=0) + np.array([[0.4], [-0.4]])
-        first = measure(np.random.default_rng(seed), profile, cycles=cycles, drift_um=drift_um)
-        drift = estimate_drift(first)
-        whole = joined(first, drift=drift)
+        old = an_old_table(rng, profile) if active else None
+        shown = profile - old.at(POSITION) if old else profile
+        first = measure(np.random.default_rng(seed), shown, cycles=cycles, drift_um=drift_um)
+        whole = joined(first, drift=estimate_drift(first))
         known = read_profile(whole)
-        table = tabulate(known)
+        table = tabulate(known, active=old)
         found = predict_test(known, table, *read_scatter_and_drift(whole), cycles=5, one_table=one_table)
-        left = profile - table.added_um(POSITION, one_table=one_table)
-        again = measure(np.random.default_rng(seed), left, cycles=cycles, drift_um=drift_um, noise=rng)
+        left = shown - table.added_um(POSITION, one_table=one_table)
+        again = measure(
+            np.random.default_rng(seed), left, cycles=cycles, drift_um=drift_um, state=STATES[state], noise=rng
+        )
         start = int(rng.integers(1, cycles - 3))
         second = evaluate_iso230(again, cycles=range(start, start + 5))
         for symbol, errors in off.items():
             errors.append((float(second[symbol]) - found[symbol].value) / found[symbol].u)
-    rms = {symbol: float(np.sqrt(np.mean(np.square(one)))) for symbol, one in off.items()}
-    inside = {symbol: rate(int((np.abs(one) <= 2.0).sum()), RUNS) for symbol, one in off.items()}
-    print(f"\n{cycles} cycles, drift {drift_um} um, one table {one_table}: error over u", rms, "within 2u", inside)
+    rms = {symbol: round(float(np.sqrt(np.mean(np.square(one)))), 2) for symbol, one in off.items()}
+    inside = {symbol: float(np.mean(np.abs(one) <= 2.0)) for symbol, one in off.items()}
+    print(
+        f"\n{cycles} cycles, {drift_um} um, {state}, one table {one_table}, active {active}: error/u {rms}, within {inside}"
+    )
     # Of 40 axes the rms is known within 11 %: three of these about 1, and a tenth for the course of the drift, which is taken as known.
-    assert all(0.65 < one < 1.45 for one in rms.values())
+    # Another state moves slope and bow, and with them A, E and M, but no reversal.
+    promised = "AEMB" if state in ("the same", "half the duty") else "B"
+    assert all(0.65 < rms[symbol] < 1.45 for symbol in promised)
 
 
 def test_the_sum_with_the_table_that_was_active_leaves_least() -> None:
@@ -146,12 +183,8 @@ def test_the_sum_with_the_table_that_was_active_leaves_least() -> None:
     found = []
     for run in range(RUNS):
         rng = np.random.default_rng(first_seed(5500) + run)
-        errors, at = axis(rng), np.arange(-10.0, 311.0, 16.0)
-        # An old table: what the axis had once, which is not what it has now.
-        old = np.array(
-            [np.interp(at, POSITION, one) for one in errors + np.cumsum(rng.normal(0.0, 0.5, (2, 16)), axis=1)]
-        )
-        active = ActiveTable("old.comp", at, old - old[0, 0])
+        errors = axis(rng)
+        active = an_old_table(rng, errors)
         first = measure(rng, errors - active.at(POSITION), cycles=10, drift_um=1.0)
         known = read_profile(joined(first, drift=estimate_drift(first)))
         table = tabulate(known, active=active)

@@ -57,10 +57,16 @@ followed = []
 if asked["readings"]:
     put("axis.x.eoffset-enable", 1)
     for row in asked["readings"]:
+        begun = time.time()
         for place, value in enumerate(row):
             put(f"thermofuse.reading-{place}", value)
         time.sleep(asked["settle_s"])
-        followed.append(
-            [pin("thermofuse.correction-0"), pin("axis.x.eoffset"), pin("joint.0.pos-cmd"), pin("thermofuse.status")]
+        pins = (
+            "thermofuse.correction-0",
+            "axis.x.eoffset",
+            "joint.0.pos-cmd",
+            "joint.0.motor-pos-cmd",
+            "thermofuse.status",
         )
+        followed.append([begun, time.time(), *map(pin, pins)])
 Path("moved.json").write_text(json.dumps({"moved": moved, "followed": followed}))
