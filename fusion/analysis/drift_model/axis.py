@@ -96,7 +96,7 @@ from fusion.analysis.drift_model.search import (
 )
 from fusion.analysis.effects.effect import Candidate, Effect
 from fusion.analysis.effects.events import cycle_starts
-from fusion.analysis.effects.laser_and_camera import CAMERA_OFFSET, REFLECTED_SOURCE
+from fusion.analysis.effects.laser_and_camera import camera_offset, reflected_source
 from fusion.analysis.effects.library import library
 from fusion.analysis.levels import SEARCH_LEVEL, SECOND_LEVEL
 from fusion.common import Array, FusionError
@@ -653,10 +653,10 @@ def find_field_errors(result: AxisResult, fields: xr.Dataset, fused: xr.Dataset)
     start = read[np.isfinite(fused["deviation"].values) & ~np.isnat(read)].min()
     frame_cycle = _cycle_of(time, fused)
     for step in result.steps:
-        if step.effect not in (CAMERA_OFFSET.name, REFLECTED_SOURCE.name):
+        if step.effect not in (camera_offset.name, reflected_source.name):
             continue
         size, u = np.array([step.coefficients[0].value, step.coefficients[0].u], float).tolist()
-        if step.effect == CAMERA_OFFSET.name:
+        if step.effect == camera_offset.name:
             size = _agreed(size, u, float(step.parameters["jump_of_the_field_K"]))
             # A microsecond of slack: the instant went through seconds in floating point.
             late = (time - start) / np.timedelta64(1, "s") >= float(step.parameters["time_s"]) - 1e-6

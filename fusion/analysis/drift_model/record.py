@@ -92,9 +92,9 @@ from fusion.analysis.drift_model.search import (
     withdraw,
 )
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
-from fusion.analysis.effects.events import STEP_EVENT, periods_min
+from fusion.analysis.effects.events import periods_min, step_event
 from fusion.analysis.effects.library import library
-from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
+from fusion.analysis.effects.thermal import QUASI_STATIC, quasi_static
 from fusion.analysis.levels import RECORD_ENTRY_LEVEL, REMAINDER_LEVEL
 from fusion.common import Array
 from fusion.results import loop as schema
@@ -161,7 +161,7 @@ def declare(declared: Sequence[str], record: Record) -> list[Term]:
                 f'declared effect {name!r} cannot be computed from a record; declare "{QUASI_STATIC}" (every displacement linear '
                 "in the temperatures), the search tries the rest of the library"
             )
-    return [Term(name, one) for name in declared for one in QUASI_STATIC_RESPONSE.candidates(record.view(), {}, None)]
+    return [Term(name, one) for name in declared for one in quasi_static.candidates(record.view(), {}, None)]
 
 
 #: Readings per coefficient that a chained block needs before it, or its prediction says nothing.
@@ -428,11 +428,11 @@ def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[st
     """Effects that can act in a record, and why the others of the library are not tried."""
     offered = library() if effects is None else effects
     # Events are found before the search, in the raw readings.
-    left = BUILT_IN - _CANDIDATES.keys() - {STEP_EVENT.name}
+    left = BUILT_IN - _CANDIDATES.keys() - {step_event.name}
     not_tried = {name: "a record has no positions" for name in offered if name in left}
     # A sensor that jumps is left out before.
     not_tried |= {name: "the sensors are examined before the search" for name in not_tried if name == "sensor_fault"}
-    return {name: effect for name, effect in offered.items() if name not in {*not_tried, STEP_EVENT.name}}, not_tried
+    return {name: effect for name, effect in offered.items() if name not in {*not_tried, step_event.name}}, not_tried
 
 
 # Grounds of a record: excitation by its drivers, noise of its sensors, and the course of a delayed sensor.
@@ -565,7 +565,7 @@ class RecordProblem(Problem[RecordFit]):
     ) -> None:
         self.record, self.train, self.rng = record, train, rng
         self.effects, self._not_tried = record_library(effects)
-        self.finds_events = effects is None or STEP_EVENT.name in effects
+        self.finds_events = effects is None or step_event.name in effects
 
     def start(self, declared: Sequence[Term]) -> RecordState:
         """The state before the search: the declared model with the events of the raw readings, and the effects that this record cannot
@@ -583,11 +583,11 @@ class RecordProblem(Problem[RecordFit]):
         error_um, scores = self.predict(state.model.terms).chained_rmse, []
         for event in found:
             gain = float(channel_gains(state.model, [event]).gain[0, 0])
-            after_um = self.predict([*state.declared, Term(STEP_EVENT.name, event)]).chained_rmse
+            after_um = self.predict([*state.declared, Term(step_event.name, event)]).chained_rmse
             ranges = {"time_s": event.onset.ends(), "duration_min": event.duration.ends(60.0)}
             confirmed = Confirmation(True, Confirmed.RAW_READINGS, error_um=after_um)
             p = event.p_value
-            scores.append(Score(STEP_EVENT.name, event, gain, gain, p, p, confirmation=confirmed, ranges=ranges))
+            scores.append(Score(step_event.name, event, gain, gain, p, p, confirmation=confirmed, ranges=ranges))
         if not scores:
             return state.decide(*decisions)
         state = state.scored(Round(tuple(scores), tuple(decisions), error_um))

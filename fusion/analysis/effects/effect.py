@@ -15,6 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from fusion.analysis.alignment.readings import Readings, Series
 from fusion.common import Array
+from thermofuse.resources import vocabulary
 
 Parameters = dict[str, float | str]
 
@@ -207,6 +208,16 @@ class Effect:
     def words(self) -> str:
         """The effect's name as a reader meets it."""
         return self.label or self.name.replace("_", " ")
+
+
+def effect(**properties: Any) -> Callable[[Offer], Effect]:
+    """Make a function an effect of the library under its own name, by which ``data/vocabulary/effects.toml`` holds its words."""
+
+    def named(candidates: Offer) -> Effect:
+        name = candidates.__name__
+        return Effect(name=name, candidates=candidates, **vocabulary("effects")[name], **properties)
+
+    return named
 
 
 # Thermal states that an effect may follow: first-order responses to the seen table and to the logged drivers, and

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import ENVIRONMENT, Readings, Series
-from fusion.analysis.effects.effect import Candidate, Effect, Parameters, Separable, Wave
+from fusion.analysis.effects.effect import Candidate, Parameters, Separable, Wave, effect
 from fusion.common import Array
 
 # Episodes in what was logged or seen: isolated jumps, sensors that stick, and the instants at which a reading could
@@ -106,7 +106,8 @@ _HARMONICS, _ORDERS = (1, 3, 7), (2, 3, 5)
 _HELD_READINGS = 12_000
 
 
-def _step_event(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(repeats=True)
+def step_event(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Steps of zero, scale and reversal at the instants that can be tried."""
     tried = event_instants(readings) if near is None or near.event_s is None else instants_near(readings, near.event_s)
     place, approach = readings.site, np.tile([0.5, -0.5], readings.targets.size)
@@ -146,7 +147,8 @@ def _off(readings: Readings, frequencies: Array) -> NDArray[np.bool_]:
     return np.asarray(np.abs(frequencies - order * cycle) > 4.0 / _span_min(readings))
 
 
-def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(repeats=True)
+def periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Waves in time, flat or along the axis."""
     place, share = readings.target_index, readings.positions_mm / readings.span_mm
     weights = {"flat": np.ones((share.size, 2)), "linear": np.column_stack([share, share])}
@@ -181,28 +183,3 @@ def _close_periods(readings: Readings, chosen_min: float) -> Array:
     near = 1.0 / chosen_min + np.linspace(-0.5, 0.5, 21) / span
     near = near[(near > 2.999 / span) & (near < 1.001 / _SHORTEST_MIN)]
     return np.asarray(1.0 / off_the_cycle(readings, near))
-
-
-STEP_EVENT = Effect(
-    name="step_event",
-    physics=(
-        "A mount, clamp or optic slips once, or the laser gets a new zero: all readings after that instant are shifted. A mirror that is "
-        "realigned or a compensation that is switched on changes them in proportion to the position, that of the backlash by the approach."
-    ),
-    source="level shift at one instant, flat, in proportion to the position, or by the direction of approach",
-    candidates=_step_event,
-    repeats=True,
-    label="sudden step or new zero",
-    phrase="a sudden step",
-    remedy="Ask whether the laser was zeroed or its beam broken at that time; if not, look at the clamping of optics and laser head.",
-)
-PERIODIC_DISTURBANCE = Effect(
-    name="periodic_disturbance",
-    physics="Cooling, coolant or air conditioning switches in a fixed rhythm.",
-    source="line in the spectrum of the readings' own times",
-    candidates=_periodic_disturbance,
-    repeats=True,
-    label="periodic disturbance",
-    phrase="a periodic disturbance",
-    remedy="Compare its period with coolant, hydraulics and air conditioning.",
-)

@@ -7,49 +7,18 @@ Physics, columns and sources of every effect: docs/method/effects.md. A user's o
 
 from __future__ import annotations
 
+from fusion.analysis.effects import events, laser_and_camera, thermal
 from fusion.analysis.effects.effect import Effect
-from fusion.analysis.effects.events import PERIODIC_DISTURBANCE, STEP_EVENT
-from fusion.analysis.effects.laser_and_camera import (
-    AIR_INDEX,
-    CAMERA_OFFSET,
-    DEAD_PATH,
-    LASER_WARM_UP,
-    MATERIAL_COMPENSATION,
-    REFLECTED_SOURCE,
-    SENSOR_FAULT,
-)
 from fusion.analysis.effects.plugins import load_plugin, plugins
-from fusion.analysis.effects.thermal import (
-    ANGULAR_GROWTH,
-    AXIS_EXPANSION,
-    LOGGED_INFLUENCE,
-    PITCH_ERROR,
-    QUASI_STATIC_RESPONSE,
-    REVERSAL_DRIFT,
-    TABLE_OFFSET,
-    THERMAL_LAG,
-    UNSEEN_HEAT_SOURCE,
-)
+from thermofuse.resources import vocabulary
 
-LIBRARY: tuple[Effect, ...] = (
-    AXIS_EXPANSION,
-    TABLE_OFFSET,
-    THERMAL_LAG,
-    UNSEEN_HEAT_SOURCE,
-    LOGGED_INFLUENCE,
-    DEAD_PATH,
-    AIR_INDEX,
-    MATERIAL_COMPENSATION,
-    ANGULAR_GROWTH,
-    REVERSAL_DRIFT,
-    STEP_EVENT,
-    PERIODIC_DISTURBANCE,
-    PITCH_ERROR,
-    CAMERA_OFFSET,
-    REFLECTED_SOURCE,
-    LASER_WARM_UP,
-    SENSOR_FAULT,
-)
+_KNOWN = {
+    effect.name: effect
+    for module in (thermal, laser_and_camera, events)
+    for effect in vars(module).values()
+    if isinstance(effect, Effect)
+}
+LIBRARY = tuple(_KNOWN[name] for name in vocabulary("effects") if name != thermal.QUASI_STATIC)
 
 
 def library() -> dict[str, Effect]:
@@ -63,4 +32,4 @@ def library() -> dict[str, Effect]:
 
 def describe_effect(name: str) -> Effect | None:
     """Find an effect by its name, the declared model of a record included."""
-    return {QUASI_STATIC_RESPONSE.name: QUASI_STATIC_RESPONSE, **library()}.get(name)
+    return {**_KNOWN, **library()}.get(name)

@@ -10,10 +10,10 @@ from fusion.analysis.alignment.readings import Readings
 from fusion.analysis.effects.effect import (
     LAGS_MIN,
     Candidate,
-    Effect,
     Parameters,
     Prior,
     Separable,
+    effect,
     first_order_responses,
     thermal_states,
     um_per,
@@ -30,13 +30,15 @@ SHORTEST_LEAD_MM = 4.0
 _VISIBLE = 1e-6
 
 
-def _angular_growth(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(masked_by=unmeasured_expansion, patterned=True)
+def angular_growth(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """States times the square of the position."""
     for state, parameters in thermal_states(readings, near):
         yield Candidate((state * readings.share**2)[:, None], parameters, (unit_of_state(readings, parameters),))
 
 
-def _reversal_drift(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(patterned=True)
+def reversal_drift(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """States times half the direction of approach; in a test of one approach, where they are a common drift, a rival of all others."""
     for state, parameters in thermal_states(readings, near):
         yield Candidate((state * 0.5 * readings.sign)[:, None], parameters, (unit_of_state(readings, parameters),))
@@ -76,7 +78,14 @@ def hidden_leads_mm(readings: Readings) -> str:
     return ", ".join(f"{lead:.3g}" for lead in leads) + " mm" if leads else ""
 
 
-def _pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+def _hidden_leads(readings: Readings) -> str:
+    """Leads of which evenly spaced targets see one phase only, in words."""
+    hidden = hidden_leads_mm(readings)
+    return f"evenly spaced targets hide leads of {hidden}; space them unevenly to see all" if hidden else ""
+
+
+@effect(patterned=True, limitation=_hidden_leads)
+def pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Waves along the axis times slow states."""
     states = list(thermal_states(readings, near))
     if near is None:
@@ -106,46 +115,6 @@ def _pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | N
             yield Candidate(along, parameters, (unit_of_state(readings, followed),) * waves.shape[1])
 
 
-def _hidden_leads(readings: Readings) -> str:
-    """Leads of which evenly spaced targets see one phase only, in words."""
-    hidden = hidden_leads_mm(readings)
-    return f"evenly spaced targets hide leads of {hidden}; space them unevenly to see all" if hidden else ""
-
-
-ANGULAR_GROWTH = Effect(
-    name="angular_growth",
-    physics="Guide or table bends as it warms; the Abbe offset turns the growing angle into an error that is quadratic along the axis.",
-    source="Abbe principle, Bryan 1979: 1 arcsec x 100 mm = 0.48 um",
-    candidates=_angular_growth,
-    masked_by=unmeasured_expansion,
-    patterned=True,
-    label="growing pitch or yaw of the axis",
-    phrase="a growing pitch or yaw of the axis",
-    remedy="Measure pitch and yaw while the machine warms up; keep the Abbe offset short.",
-)
-REVERSAL_DRIFT = Effect(
-    name="reversal_drift",
-    physics="Backlash or wind-up changes with temperature: both directions move apart by the same amount at every position.",
-    source="ISO 230-2, reversal value B",
-    candidates=_reversal_drift,
-    patterned=True,
-    label="reversal that changes with time",
-    phrase="a reversal error that changes",
-    remedy="Check screw preload, gibs and the scale's coupling; measure the reversal warm and cold.",
-)
-PITCH_ERROR = Effect(
-    name="pitch_error",
-    physics="The cyclic error of the screw changes as it warms: a wave along the axis whose size follows a thermal state.",
-    source="periodic error of the lead; aliased where the spacing is a multiple of the lead",
-    candidates=_pitch_error,
-    patterned=True,
-    limitation=_hidden_leads,
-    label="pitch error of the screw",
-    phrase="a changing pitch error of the screw",
-    remedy="Repeat with a target spacing that is no multiple of the screw's lead.",
-)
-
-
 #: Standard uncertainty of what an axis expands by: steels and cast irons lie between 9 and 14 ppm/K, and what holds the axis takes part.
 EXPANSION_U_PPM_PER_K = 2.0
 #: Name of the declared model of a record: every displacement a linear function of the temperatures.
@@ -168,17 +137,20 @@ def _needs_driver(readings: Readings) -> str | None:
     return None if readings.drivers else needed
 
 
-def _axis_expansion(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(needs=needs_field, follows_field=True, prior=Prior(11.7, EXPANSION_U_PPM_PER_K), declarable=True)
+def axis_expansion(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Integral of the seen rise along the measured line: K mm times 1e-6 is 1e-3 um per ppm/K."""
     yield Candidate((readings.at(readings.series["axis_integral"]) * 1e-3)[:, None], {}, ("ppm/K",))
 
 
-def _table_offset(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(needs=needs_field, follows_field=True, declarable=True)
+def table_offset(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Mean rise of the seen table."""
     yield Candidate(readings.at(readings.series["mean_rise"])[:, None], {}, ("um/K",))
 
 
-def _thermal_lag(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(needs=needs_field, follows_field=True, excited_by="field")
+def thermal_lag(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Delayed copies of the seen temperatures, flat and along the axis."""
     # Between two frames the field is a straight line; a shorter lag is not in the data.
     frames_min = float(np.median(np.diff(readings.series["mean_rise"].seconds))) / 60.0
@@ -199,7 +171,8 @@ def _thermal_lag(readings: Readings, _: Mapping[str, float], near: Candidate | N
         yield Candidate(bending[:, None], {**response, "shape": "bending"}, ("um/K",))
 
 
-def _unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(needs=_needs_driver, masked_by=unmeasured_expansion, excited_by="driver")
+def unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Responses to the logged drivers, flat and along the axis."""
     for name in readings.drivers:
         unit = um_per(readings.series[name].units)
@@ -232,7 +205,12 @@ def _logged(readings: Readings) -> list[str]:
     return [name for name in readings.series if name not in _NO_INFLUENCE and name not in readings.drivers]
 
 
-def _logged_influence(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(
+    needs=lambda readings: None if _logged(readings) else "no room, coolant or humidity was logged",
+    masked_by=unmeasured_expansion,
+    excited_by="driver",
+)
+def logged_influence(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Delayed copies of every logged series, flat and along the axis."""
     for name in _logged(readings):
         unit = um_per(readings.series[name].units)
@@ -246,93 +224,8 @@ def _logged_influence(readings: Readings, _: Mapping[str, float], near: Candidat
                 yield Candidate(columns, parameters, (unit,) * len(along))
 
 
-def _quasi_static(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+@effect(declarable=True)
+def quasi_static(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Rise of every temperature sensor."""
     sensors = [series for name, series in readings.series.items() if name.startswith(SENSOR_PREFIX)]
     yield Candidate(np.column_stack([readings.at(series) for series in sensors]), {}, ("um/K",) * len(sensors))
-
-
-AXIS_EXPANSION = Effect(
-    name="axis_expansion",
-    physics="The table lengthens along the measured line as it warms: one coefficient times the integral of the seen rise.",
-    source="ISO/TR 16015; steel 11.7 ppm/K",
-    candidates=_axis_expansion,
-    needs=needs_field,
-    follows_field=True,
-    prior=Prior(11.7, EXPANSION_U_PPM_PER_K),
-    declarable=True,
-    label="expansion of the axis",
-    phrase="the expansion of the axis",
-    remedy="Check the expansion coefficient and the probe place that the laser's compensation uses.",
-)
-TABLE_OFFSET = Effect(
-    name="table_offset",
-    physics=(
-        "Everything between table and laser moves together with the table's mean temperature: the same shift at all positions."
-    ),
-    source="ISO 230-3, thermal distortion",
-    candidates=_table_offset,
-    needs=needs_field,
-    follows_field=True,
-    declarable=True,
-    label="shift with the table's mean temperature",
-    phrase="a shift with the table's mean temperature",
-    remedy="Look at the thermal path from table to scale and at the table's clamping.",
-)
-THERMAL_LAG = Effect(
-    name="thermal_lag",
-    physics=(
-        "A remote or massive part follows the seen table late, with a time constant of its own, and goes on moving after it; a bed whose "
-        "lower side is late bends meanwhile."
-    ),
-    source="first-order response of a lumped heat capacity; Bryan 1979 for the Abbe offset of a bending bed",
-    candidates=_thermal_lag,
-    needs=needs_field,
-    follows_field=True,
-    excited_by="field",
-    label="thermal lag of a remote structure",
-    phrase="a part of the machine that follows the measured temperatures with a lag",
-    remedy="Wait longer before measuring, or log the temperature of the column and the bed.",
-)
-UNSEEN_HEAT_SOURCE = Effect(
-    name="unseen_heat_source",
-    physics=(
-        "A source out of the camera's sight (spindle, motor, bearing) warms with the logged load and moves the reading with its "
-        "own time constant."
-    ),
-    source="Mayr et al. 2012, CIRP Annals 61, 771",
-    candidates=_unseen_heat_source,
-    needs=_needs_driver,
-    masked_by=unmeasured_expansion,
-    excited_by="driver",
-    label="unseen heat source",
-    phrase="a heat source that the camera does not see",
-    remedy=(
-        "Look for the source where neither camera nor sensors reach: spindle, motor, drive, screw bearing, hydraulics; log its duty."
-    ),
-)
-LOGGED_INFLUENCE = Effect(
-    name="logged_influence",
-    physics=(
-        "A part of the machine or of the laser's set-up follows a quantity that was logged beside field and loads (temperature of room or "
-        "coolant, humidity) with a time constant of its own."
-    ),
-    source="ISO 230-3, environmental temperature variation error",
-    candidates=_logged_influence,
-    needs=lambda readings: None if _logged(readings) else "no room, coolant or humidity was logged",
-    masked_by=unmeasured_expansion,
-    excited_by="driver",
-    label="influence of a logged quantity",
-    phrase="a part that follows a logged quantity late",
-    remedy="Keep that quantity steady, or let a compensation follow it; look for the part that it reaches so late.",
-)
-QUASI_STATIC_RESPONSE = Effect(
-    name=QUASI_STATIC,
-    physics="Every displacement follows the temperatures at once: the declared model of a record.",
-    source="ISO 230-3",
-    candidates=_quasi_static,
-    declarable=True,
-    label="quasi-static response to the temperatures",
-    phrase="thermal expansion in proportion to the measured temperatures",
-    remedy="Check that the sensors sit on the parts that move the tool and the work.",
-)

@@ -47,7 +47,7 @@ from fusion.analysis.drift_model.search import (
     search,
 )
 from fusion.analysis.effects.effect import Candidate, Separable
-from fusion.analysis.effects.thermal import PITCH_ERROR
+from fusion.analysis.effects.thermal import pitch_error
 from fusion.report.wording import parameters
 from fusion.results.loop import Nothing
 from tests.fusion.loop_bench import readings_of
@@ -717,8 +717,8 @@ def test_a_closer_look_stays_among_waves_that_a_screw_can_make():
     """Half a travel is the longest wave that is tried; the states that scale it are all offered again."""
     readings = readings_of(seed=3)
     travel = float(np.ptp(readings.positions_mm))
-    longest = next(candidate for candidate in PITCH_ERROR.candidates(readings, {}, None))
+    longest = next(candidate for candidate in pitch_error.candidates(readings, {}, None))
     assert longest.parameters["period_mm"] == pytest.approx(travel / 2)
-    near = list(PITCH_ERROR.candidates(readings, {}, longest))
+    near = list(pitch_error.candidates(readings, {}, longest))
     assert max(candidate.parameters["period_mm"] for candidate in near) <= travel / 2 * 1.001
     assert {candidate.parameters["follows"] for candidate in near} == {"mean_rise", "duty", "warm_up"}

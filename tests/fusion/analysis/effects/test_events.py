@@ -10,8 +10,6 @@ import pytest
 from fusion.analysis.alignment.readings import Series
 from fusion.analysis.effects.effect import Candidate
 from fusion.analysis.effects.events import (
-    PERIODIC_DISTURBANCE,
-    STEP_EVENT,
     cycle_starts,
     detect_jumps,
     detect_sensor_jumps,
@@ -19,7 +17,9 @@ from fusion.analysis.effects.events import (
     event_instants,
     instants_near,
     off_the_cycle,
+    periodic_disturbance,
     periods_min,
+    step_event,
 )
 from tests.fusion.small_campaign import campaign, logged, period_s
 
@@ -30,7 +30,7 @@ def span_min(readings) -> float:
 
 def test_a_step_is_zero_before_its_instant_and_one_from_it_on():
     readings = campaign(cycles=12)
-    candidates = list(STEP_EVENT.candidates(readings, {}, None))
+    candidates = list(step_event.candidates(readings, {}, None))
     assert len(candidates) == 3 * 32
     heights = {"flat": 1.0, "linear": 1e-3 * readings.position_mm, "reversal": 0.5 * readings.sign}
     for candidate in candidates:
@@ -47,15 +47,15 @@ def test_a_step_is_zero_before_its_instant_and_one_from_it_on():
 def test_a_step_is_looked_at_more_closely_at_the_readings():
     readings = campaign(cycles=12)
     chosen = Candidate(np.empty((0, 1)), {"time_s": 325.0}, ("um",), event_s=325.0)
-    near = [one for one in STEP_EVENT.candidates(readings, {}, chosen) if one.parameters["shape"] == "flat"]
+    near = [one for one in step_event.candidates(readings, {}, chosen) if one.parameters["shape"] == "flat"]
     assert [candidate.event_s for candidate in near] == [300.0, 310.0, 320.0, 330.0]
     one_way = campaign(cycles=12, both_directions=False)
-    assert {one.parameters["shape"] for one in STEP_EVENT.candidates(one_way, {}, None)} == {"flat", "linear"}
+    assert {one.parameters["shape"] for one in step_event.candidates(one_way, {}, None)} == {"flat", "linear"}
 
 
 def test_a_wave_has_its_period_in_minutes_flat_or_along_the_axis():
     readings = campaign(cycles=40)
-    flat, linear = list(PERIODIC_DISTURBANCE.candidates(readings, {}, None))[:2]
+    flat, linear = list(periodic_disturbance.candidates(readings, {}, None))[:2]
     period = flat.parameters["period_min"]
     phase = 2.0 * np.pi * readings.seconds / 60.0 / period
     np.testing.assert_allclose(flat.columns, np.column_stack([np.cos(phase), np.sin(phase)]), atol=1e-9)
@@ -69,7 +69,7 @@ def test_waves_of_a_long_test_are_not_held_at_all_readings(monkeypatch):
     """Three hundred periods of them would take 0.3 GB at 10,000 cycles of six readings."""
     monkeypatch.setattr("fusion.analysis.effects.events._HELD_READINGS", 100)
     readings = campaign(cycles=400)
-    candidates = list(PERIODIC_DISTURBANCE.candidates(readings, {}, None))
+    candidates = list(periodic_disturbance.candidates(readings, {}, None))
     waves = {id(course): course for candidate in candidates for course in candidate.columns.courses}
     assert len(waves) == len(candidates) > 100
     assert all(wave.seconds is readings.seconds for wave in waves.values())
@@ -101,7 +101,7 @@ def test_frequencies_within_four_lines_of_a_multiple_of_the_cycle_are_left_out()
 def test_at_most_three_hundred_periods_are_tried_the_longest_first():
     readings = campaign(cycles=300)
     assert periods_min(readings).size > 300
-    candidates = list(PERIODIC_DISTURBANCE.candidates(readings, {}, None))
+    candidates = list(periodic_disturbance.candidates(readings, {}, None))
     assert len(candidates) == 600
     assert candidates[0].parameters["period_min"] == pytest.approx(span_min(readings) / 3.0)
 
@@ -122,7 +122,7 @@ def test_a_closer_look_stays_within_half_a_line_and_within_the_search():
 
     def frequencies_about(period: float) -> np.ndarray:
         chosen = Candidate(np.empty((0, 2)), {"period_min": period}, ("um", "um"))
-        near = PERIODIC_DISTURBANCE.candidates(readings, {}, chosen)
+        near = periodic_disturbance.candidates(readings, {}, chosen)
         sines = [one for one in near if len(one.units) == 2 and one.parameters["period_min"] < 1.5 * period]
         return np.unique([1.0 / one.parameters["period_min"] for one in sines])
 
@@ -137,7 +137,7 @@ def test_a_closer_look_at_a_wave_holds_the_rhythm_of_which_it_is_a_harmonic():
     """The drift hides the slow wave of a rhythm that switches, so that the search meets its third harmonic first."""
     readings = campaign(cycles=80)
     chosen = Candidate(np.empty((0, 2)), {"period_min": 10.0}, ("um", "um"))
-    near = PERIODIC_DISTURBANCE.candidates(readings, {}, chosen)
+    near = periodic_disturbance.candidates(readings, {}, chosen)
     rhythm = [one for one in near if one.parameters["period_min"] == pytest.approx(30.0) and len(one.units) > 2]
     assert rhythm and all(str(one.parameters["course"]).startswith("no sine") for one in rhythm)
     third = np.cos(2.0 * np.pi * readings.seconds / 600.0)

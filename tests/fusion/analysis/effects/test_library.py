@@ -16,7 +16,7 @@ from fusion.analysis.effects import plugins as module
 from fusion.analysis.effects.effect import Effect
 from fusion.analysis.effects.library import LIBRARY, describe_effect, library
 from fusion.analysis.effects.plugins import PluginError, describe_code, leave_plugins_out, load_plugin, plugins
-from fusion.analysis.effects.thermal import QUASI_STATIC_RESPONSE
+from fusion.analysis.effects.thermal import quasi_static
 from fusion.results.parts import PluginPart
 from tests.fusion.small_campaign import campaign, logged
 
@@ -41,7 +41,7 @@ def everything() -> Readings:
     return campaign(cycles=14, positions_mm=tuple(positions), series=series, drivers=("duty",))
 
 
-@pytest.mark.parametrize("effect", [*LIBRARY, QUASI_STATIC_RESPONSE], ids=lambda effect: effect.name)
+@pytest.mark.parametrize("effect", [*LIBRARY, quasi_static], ids=lambda effect: effect.name)
 def test_every_effect_keeps_its_contract(effect):
     readings = everything()
     assert effect.label and effect.remedy and effect.physics and effect.source
@@ -64,7 +64,7 @@ def test_a_declarable_effect_has_one_candidate_without_a_model():
     for name in declarable:
         (candidate,) = library()[name].candidates(everything(), {}, None)
         assert candidate.parameters == {} and candidate.columns.any()
-    assert QUASI_STATIC_RESPONSE.declarable
+    assert quasi_static.declarable
 
 
 def test_every_effect_with_a_parameter_is_offered_again_near_each_of_its_candidates():
@@ -96,7 +96,7 @@ def test_a_users_effect_is_added_or_replaces_one_of_the_same_name(monkeypatch):
 
 
 def test_effects_are_described_by_name_the_declared_model_of_a_record_included():
-    assert describe_effect("quasi_static") is QUASI_STATIC_RESPONSE
+    assert describe_effect("quasi_static") is quasi_static
     assert describe_effect("dead_path") is library()["dead_path"]
     assert describe_effect("sun_spots") is None
 

@@ -10,17 +10,17 @@ import pytest
 from fusion.analysis.alignment.readings import Readings, Series
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Prior, thermal_states
 from fusion.analysis.effects.thermal import (
-    ANGULAR_GROWTH,
-    AXIS_EXPANSION,
-    LOGGED_INFLUENCE,
-    PITCH_ERROR,
-    QUASI_STATIC_RESPONSE,
-    REVERSAL_DRIFT,
-    TABLE_OFFSET,
-    THERMAL_LAG,
-    UNSEEN_HEAT_SOURCE,
+    angular_growth,
+    axis_expansion,
     hidden_leads_mm,
+    logged_influence,
     needs_field,
+    pitch_error,
+    quasi_static,
+    reversal_drift,
+    table_offset,
+    thermal_lag,
+    unseen_heat_source,
 )
 from tests.fusion.small_campaign import campaign, logged
 
@@ -40,23 +40,23 @@ def seen(*, step_s: float = 30.0) -> Readings:
 
 def test_a_uniform_rise_expands_the_axis_in_proportion_to_the_position():
     readings = seen()
-    (candidate,) = AXIS_EXPANSION.candidates(readings, {}, None)
+    (candidate,) = axis_expansion.candidates(readings, {}, None)
     # 1 ppm/K times 1 K times 1 m is 1 um.
     np.testing.assert_allclose(candidate.columns[:, 0], readings.seconds / 30.0 * readings.position_mm * 1e-3)
     assert candidate.units == ("ppm/K",) and candidate.event_s is None
-    assert AXIS_EXPANSION.prior == Prior(11.7, 2.0)
+    assert axis_expansion.prior == Prior(11.7, 2.0)
 
 
 def test_the_table_shifts_all_positions_alike():
     readings = seen()
-    (candidate,) = TABLE_OFFSET.candidates(readings, {}, None)
+    (candidate,) = table_offset.candidates(readings, {}, None)
     np.testing.assert_allclose(candidate.columns[:, 0], readings.seconds / 30.0)
     assert candidate.units == ("um/K",)
 
 
 def test_a_lag_delays_the_field_flat_along_the_axis_or_both_or_bends_the_bed():
     readings = seen()
-    candidates = list(THERMAL_LAG.candidates(readings, {}, None))
+    candidates = list(thermal_lag.candidates(readings, {}, None))
     # Four shapes, each of one body or two.
     assert len(candidates) == 2 * 4 * len(LAGS_MIN)
     flat, linear, both, bending = candidates[8:12]
@@ -82,13 +82,13 @@ def test_a_lag_delays_the_field_flat_along_the_axis_or_both_or_bends_the_bed():
 
 @pytest.mark.parametrize(("step_s", "shortest"), [(150.0, 5.0), (151.0, 7.5)])
 def test_a_lag_shorter_than_two_frames_is_not_in_the_data(step_s, shortest):
-    candidates = THERMAL_LAG.candidates(seen(step_s=step_s), {}, None)
+    candidates = thermal_lag.candidates(seen(step_s=step_s), {}, None)
     assert min(candidate.parameters["time_constant_min"] for candidate in candidates) == shortest
 
 
 def test_a_source_follows_its_driver_settled_or_with_a_memory_that_dies_away():
     readings = seen()
-    candidates = list(UNSEEN_HEAT_SOURCE.candidates(readings, {}, None))
+    candidates = list(unseen_heat_source.candidates(readings, {}, None))
     # Ten time constants, each of one body or two; three shapes; two starts.
     assert len(candidates) == 10 * 2 * 3 * 2
     first = candidates[:6]
@@ -121,7 +121,7 @@ def test_a_source_follows_its_driver_settled_or_with_a_memory_that_dies_away():
 
 def test_a_driver_with_a_unit_gives_its_coefficient_one():
     readings = campaign(series={"speed": logged(np.ones(60), "1/min")}, drivers=("speed",))
-    free = list(UNSEEN_HEAT_SOURCE.candidates(readings, {}, None))[5]
+    free = list(unseen_heat_source.candidates(readings, {}, None))[5]
     assert free.units == ("um/(1/min)", "um/(1/min)", "um", "um")
 
 
@@ -132,7 +132,7 @@ def test_a_quasi_static_response_has_a_column_for_every_sensor():
         "temperature column": logged(-2.0 * RISE, "K"),
     }
     readings = campaign(series=series)
-    (candidate,) = QUASI_STATIC_RESPONSE.candidates(readings, {}, None)
+    (candidate,) = quasi_static.candidates(readings, {}, None)
     np.testing.assert_allclose(candidate.columns, np.outer(readings.seconds / 30.0, [1.0, -2.0]))
     assert candidate.units == ("um/K", "um/K")
 
@@ -140,11 +140,11 @@ def test_a_quasi_static_response_has_a_column_for_every_sensor():
 def test_what_is_missing_is_said():
     empty = campaign()
     assert needs_field(seen()) is None and needs_field(empty) == "the campaign holds no temperature of the table"
-    for effect in (AXIS_EXPANSION, TABLE_OFFSET, THERMAL_LAG):
+    for effect in (axis_expansion, table_offset, thermal_lag):
         assert effect.needs(empty) == "the campaign holds no temperature of the table"
         assert effect.needs(seen()) is None
-    assert UNSEEN_HEAT_SOURCE.needs(seen()) is None
-    assert UNSEEN_HEAT_SOURCE.needs(empty) == (
+    assert unseen_heat_source.needs(seen()) is None
+    assert unseen_heat_source.needs(empty) == (
         "nothing that drives a heat source was logged; log duty, speed or load as [drivers]"
     )
 
@@ -163,7 +163,7 @@ def warmed(positions: tuple[float, ...] = EVEN) -> Readings:
 
 def test_bending_grows_with_the_square_of_the_position_and_with_the_state():
     readings = warmed()
-    candidates = list(ANGULAR_GROWTH.candidates(readings, {}, None))
+    candidates = list(angular_growth.candidates(readings, {}, None))
     states = list(thermal_states(readings, None))
     assert len(candidates) == len(states) == 22
     for candidate, (state, parameters) in zip(candidates, states, strict=True):
@@ -174,7 +174,7 @@ def test_bending_grows_with_the_square_of_the_position_and_with_the_state():
 
 def test_a_reversal_moves_both_directions_apart_by_the_state():
     readings = warmed()
-    candidate = next(iter(REVERSAL_DRIFT.candidates(readings, {}, None)))
+    candidate = next(iter(reversal_drift.candidates(readings, {}, None)))
     np.testing.assert_allclose(
         candidate.columns[:, 0], np.where(readings.sign > 0, 0.5, -0.5) * readings.seconds / 30.0
     )
@@ -182,8 +182,8 @@ def test_a_reversal_moves_both_directions_apart_by_the_state():
 
 def test_in_a_test_of_one_approach_a_reversal_that_drifts_is_a_common_drift_and_tried_beside_the_others():
     readings = campaign(both_directions=False)
-    assert REVERSAL_DRIFT.needs(readings) is None
-    candidates, states = list(REVERSAL_DRIFT.candidates(readings, {}, None)), list(thermal_states(readings, None))
+    assert reversal_drift.needs(readings) is None
+    candidates, states = list(reversal_drift.candidates(readings, {}, None)), list(thermal_states(readings, None))
     assert len(candidates) == len(states) > 0
     for candidate, (state, _) in zip(candidates, states, strict=True):
         np.testing.assert_array_equal(candidate.columns[:, 0], 0.5 * state)
@@ -191,7 +191,7 @@ def test_in_a_test_of_one_approach_a_reversal_that_drifts_is_a_common_drift_and_
 
 def test_a_pitch_error_is_a_wave_along_the_axis_times_a_state():
     readings = warmed()
-    candidates = list(PITCH_ERROR.candidates(readings, {}, None))
+    candidates = list(pitch_error.candidates(readings, {}, None))
     # Two periods over the travel of 300 mm up to one in two spacings, in steps of half a period.
     assert list(dict.fromkeys(c.parameters["period_mm"] for c in candidates)) == pytest.approx([150.0, 120.0, 100.0])
     followed = [
@@ -214,7 +214,7 @@ def test_a_pitch_error_is_a_wave_along_the_axis_times_a_state():
 
 def test_uneven_targets_tell_leads_apart_down_to_four_millimetres():
     readings = warmed(UNEVEN)
-    candidates = list(PITCH_ERROR.candidates(readings, {}, None))
+    candidates = list(pitch_error.candidates(readings, {}, None))
     periods = list(dict.fromkeys(c.parameters["period_mm"] for c in candidates))
     np.testing.assert_allclose(periods, 300.0 / np.arange(2.0, 75.001, 0.5))
     # Each follows one course of every kind only.
@@ -231,13 +231,13 @@ def test_uneven_targets_tell_leads_apart_down_to_four_millimetres():
 def test_spacings_within_a_hundredth_count_as_even(shift, even):
     """A target that is off by d makes one spacing longer and the next shorter: a range of 2 d."""
     positions = (50.0, 100.0, 150.0 + shift, 200.0, 250.0, 300.0, 350.0)
-    first = next(iter(PITCH_ERROR.candidates(warmed(positions), {}, None)))
+    first = next(iter(pitch_error.candidates(warmed(positions), {}, None)))
     assert ("no alias" in str(first.parameters["possible_leads"])) is not even
 
 
 def test_leads_that_look_alike_on_even_targets_are_listed():
     """Targets every 50 mm see a wave of 150 mm where 1 / lead is a multiple of 1 / 50 plus or minus 1 / 150."""
-    first = next(iter(PITCH_ERROR.candidates(warmed(), {}, None)))
+    first = next(iter(pitch_error.candidates(warmed(), {}, None)))
     leads = [float(lead) for lead in str(first.parameters["possible_leads"]).removesuffix(" mm").split(", ")]
     expected = sorted(
         (1 / f for k in range(30) for f in (k / 50 - 1 / 150, k / 50 + 1 / 150) if 1 / 50 <= f <= 1 / 2), reverse=True
@@ -251,12 +251,12 @@ def test_a_closer_look_at_a_wave_stays_within_the_search():
     chosen = Candidate(
         np.empty((0, 2)), {"period_mm": 120.0, "follows": "warm_up", "time_constant_min": 60.0}, ("um", "um")
     )
-    near = {c.parameters["period_mm"] for c in PITCH_ERROR.candidates(readings, {}, chosen)}
+    near = {c.parameters["period_mm"] for c in pitch_error.candidates(readings, {}, chosen)}
     assert sorted(near) == pytest.approx(sorted(300.0 / (2.5 + np.linspace(-0.25, 0.25, 5))))
     widest = Candidate(
         np.empty((0, 2)), {"period_mm": 150.0, "follows": "warm_up", "time_constant_min": 60.0}, ("um", "um")
     )
-    near = {c.parameters["period_mm"] for c in PITCH_ERROR.candidates(readings, {}, widest)}
+    near = {c.parameters["period_mm"] for c in pitch_error.candidates(readings, {}, widest)}
     assert sorted(near) == pytest.approx(sorted(300.0 / (2.0 + np.linspace(0.0, 0.25, 3))))
 
 
@@ -283,7 +283,7 @@ def test_every_log_beside_field_and_loads_may_be_followed_late():
         "relative_humidity": logged(wave, "percent"),
     }
     readings = campaign(cycles=14, series=series, drivers=("duty",))
-    offered = list(LOGGED_INFLUENCE.candidates(readings, {}, None))
+    offered = list(logged_influence.candidates(readings, {}, None))
     assert {one.parameters["follows"] for one in offered} == {"relative_humidity"}
     assert {one.parameters["shape"] for one in offered} == {"flat", "linear", "flat and linear"}
     late = readings.at(series["relative_humidity"].lagged(300.0))
@@ -293,7 +293,7 @@ def test_every_log_beside_field_and_loads_may_be_followed_late():
     lifted = replace(
         readings, series={**series, "relative_humidity": replace(series["relative_humidity"], values=1e3 + wave)}
     )
-    for one, other in zip(offered, LOGGED_INFLUENCE.candidates(lifted, {}, None), strict=True):
+    for one, other in zip(offered, logged_influence.candidates(lifted, {}, None), strict=True):
         np.testing.assert_allclose(one.columns, other.columns, atol=1e-9)
     bare = replace(readings, series={name: one for name, one in series.items() if name != "relative_humidity"})
-    assert LOGGED_INFLUENCE.needs(bare) == "no room, coolant or humidity was logged"
+    assert logged_influence.needs(bare) == "no room, coolant or humidity was logged"
