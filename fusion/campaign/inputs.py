@@ -147,17 +147,9 @@ def camera_accuracy_notices(table: ThermographyTable, frames: Sequence[FrameRefe
     if not read:
         return
     if table.camera_offset_u_K is None:
-        yield Notice(
-            "camera_accuracy_assumed",
-            "The files hold temperatures and not what camera took them: the accuracy of an uncooled camera was assumed.",
-            'Write the accuracy of its data sheet under [thermography], for example camera_offset_u = "1 K" and camera_scale_u = 0.01.',
-        )
+        yield Notice.of("camera_accuracy_assumed")
     if any(frame.options.emissivity is None for frame in read):
-        yield Notice(
-            "stack_emissivity_unknown",
-            "The emissivity with which the camera's program calculated the temperatures is not stated; they are taken as they are.",
-            "Write emissivity and reflected_temperature under [thermography.stack] as they were set in the camera.",
-        )
+        yield Notice.of("stack_emissivity_unknown")
 
 
 # What a campaign was read into, before anything is calculated: the inputs of either instrument, or of both.
@@ -461,10 +453,8 @@ def _timed_cycles(deviations: xr.Dataset, *, file: str) -> tuple[xr.Dataset, lis
         return deviations, []
     numbers = listed(str(number) for number in cycle[~timed])
     return deviations.isel(cycle=timed), [
-        Notice(
-            "cycles_left_out",
-            f"{counted(int((~timed).sum()), 'cycle')} of {cycle.size} in {file} left out, as none of their readings has a time: {numbers}.",
-            "Give the times of their readings, or measure them again; the estimates allow for the gaps.",
+        Notice.of(
+            "cycles_left_out", cycles=counted(int((~timed).sum()), "cycle"), size=cycle.size, file=file, numbers=numbers
         )
     ]
 
@@ -608,7 +598,7 @@ def _camera_notices(source: CameraInputs) -> list[Notice]:
     notices = [*frames_notices(source.frames_rejected), *pipe_notices(source.campaign)]
     if remarks := Counter(note for frame in source.frames for note in frame.notes):
         named = [f"{note} ({counted(count, 'frame')})" for note, count in remarks.items()]
-        notices.append(Notice("frames_read_with_remarks", f"Remarks of the reader of the frames: {listed(named)}.", ""))
+        notices.append(Notice.of("frames_read_with_remarks", named=listed(named)))
     notices += _checksum_notices(source.frames)
     return [*notices, *camera_accuracy_notices(source.thermography, source.frames)]
 
@@ -618,12 +608,7 @@ def _checksum_notices(frames: Sequence[FrameReference]) -> Iterator[Notice]:
     listed_frames = FrameList.of(frames)
     named = [f"{frame.path.name}, frame {frame.index}" for frame in listed_frames.choose(listed_frames.altered())]
     if named:
-        yield Notice(
-            "frames_checksum",
-            f"The headers of {counted(len(named), 'frame')} differ from their checksums: {listed(named)}. The files were changed after the "
-            "camera wrote them.",
-            "Compare these files with the originals, or leave them out (parameters and temperatures may be wrong).",
-        )
+        yield Notice.of("frames_checksum", frames=counted(len(named), "frame"), named=listed(named))
 
 
 def window_notice(source: CameraInputs) -> Notice:
@@ -635,7 +620,7 @@ def window_notice(source: CameraInputs) -> Notice:
     told = "as thermography.window states" if stated else "a usual length here (thermography.window sets another)"
     each = "each" if windows == len(bounds) else f"each of the {len(bounds)} that hold a frame"
     divided = f"the frames are divided into {counted(windows, 'window')} of {length}, {told}"
-    return Notice("cycles_from_windows", f"No laser gives cycles: {divided}; {each} counts as a cycle.", "")
+    return Notice.of("cycles_from_windows", divided=divided, each=each)
 
 
 def _log_notices(source: Inputs) -> list[Notice]:
@@ -643,11 +628,7 @@ def _log_notices(source: Inputs) -> list[Notice]:
     notices, sensors = [], source.sensors
     if sensors is not None and sensors.faults:
         named = "; ".join(f"{sensors.logged['sensor'].values[fault.sensor]} {fault.words}" for fault in sensors.faults)
-        message = (
-            f"Faulty contact sensors of {sensors.file}: {named}. They are left out of all that is calculated, also before the fault, "
-            "so that one set of sensors serves the whole test and the fault is no step of the table."
-        )
-        notices.append(Notice("sensors_left_out", message, "Look at contact and cable."))
+        notices.append(Notice.of("sensors_left_out", file=sensors.file, named=named))
     for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
         if table is not None:
             notices += [*left_out_notices(table, code), *clock_notices(table)]
@@ -659,24 +640,15 @@ def _laser_notices(source: LaserInputs) -> list[Notice]:
     notices = left_out_notices(source.deviations, "readings_left_out")
     if notes := json.loads(source.deviations.attrs.get("notes", "[]")):
         said = "; ".join(note.removeprefix("warning: ") for note in notes)
-        message = f"{source.interferometry.deviations} was interpreted as follows: {said}."
-        notices.append(Notice("readings_as_read", message, "Compare with the protocol of the test."))
+        notices.append(Notice.of("readings_as_read", deviations=source.interferometry.deviations, said=said))
     notices += _log_notices(source)
     if reason := lacks_course(source.deviations):
         five = source.deviations.sizes["cycle"] >= STANDARD_CYCLES
         notices.append(Notice("standard_alone", reason, "" if five else f"Measure {STANDARD_CYCLES} cycles."))
     elif not _is_timed(source.deviations):
-        message = (
-            f"{source.interferometry.deviations} gives no times: ISO 230-2 and neighbour differences are evaluated; drift, positions "
-            "that stand out and causes need the time of every reading, and no log can be set beside them."
-        )
-        notices.append(
-            Notice("no_times", message, "To see drift and its causes, export one reading per line with its time.")
-        )
+        notices.append(Notice.of("no_times", deviations=source.interferometry.deviations))
     elif source.environment is None:
-        message = "No environment was logged, so effects of the air and of the material compensation cannot be separated from the drift."
-        remedy = "Log air temperature, pressure, humidity and material temperature, and name the file as interferometry.environment."
-        notices.append(Notice("no_environment", message, remedy))
+        notices.append(Notice.of("no_environment"))
     return notices
 
 

@@ -81,9 +81,6 @@ def material_by_cycle(deviations: xr.Dataset, environment: xr.Dataset | None) ->
     return xr.DataArray(values, dims="cycle", coords={"cycle": numbers})
 
 
-_NO_LOG = "log air temperature, pressure and humidity, and name the file as [interferometry] environment"
-
-
 class RecompensationError(CampaignError):
     """The compensation cannot be repeated with the data of the campaign; the message says what is missing."""
 
@@ -119,7 +116,10 @@ def compensate_readings(
         corrected, notices = _correct_dead_path(deviations, environment, table.dead_path_mm)
         return Compensated(corrected, state_budget(table), notices)
     if environment is None:
-        raise RecompensationError(f'[interferometry] compensation = "redo" needs the air: {_NO_LOG}')
+        raise RecompensationError(
+            '[interferometry] compensation = "redo" needs the air: log air temperature, pressure and humidity, and name the file as '
+            "[interferometry] environment"
+        )
     log, coefficient = environment.dropna("time", subset=AIR_AND_MATERIAL), table.expansion_coefficient_ppm_per_K
     stated = _stated_factor_um(deviations, table)
     applied = stated or followed_factor_um(deviations, log, expansion_coefficient_ppm_per_K=coefficient)
@@ -161,13 +161,14 @@ def _redone(redone: xr.Dataset, stated: bool, material: SeenMaterial | None) -> 
     if material is not None:
         probe = f"the temperature that the camera measured along the axis (u {material.u_K:.2g} K)"
     u = float(redone["compensation_u"].max())
-    return Notice(
+    return Notice.of(
         "compensation_redone",
-        f"The laser's compensation was done again: {undone} was removed, the logged air and {probe} were used instead. This moved the "
-        f"readings by {float(added.min()):+.2f} to {float(added.max()):+.2f} µm; standard uncertainty up to {u:.2f} µm. "
-        'The setting compensation = "as recorded" under [interferometry] leaves the readings as they are.',
-        "",
-        float(np.abs(added).max()),
+        effect_um=float(np.abs(added).max()),
+        undone=undone,
+        probe=probe,
+        least=float(added.min()),
+        most=float(added.max()),
+        u=u,
     )
 
 
@@ -192,8 +193,7 @@ def _correct_dead_path(
     if dead_path_mm == 0.0:
         return deviations, []
     if environment is None:
-        message = f"The dead path of {dead_path_mm:g} mm is not corrected: the air was not logged."
-        return deviations, [Notice("dead_path_uncorrected", message, _NO_LOG)]
+        return deviations, [Notice.of("dead_path_uncorrected", dead_path_mm=dead_path_mm)]
     log = environment.dropna("time", subset=AIR_AND_MATERIAL)
     start = log["time"].values[0]
     readings_s, log_s = (
@@ -205,8 +205,6 @@ def _correct_dead_path(
     first = float(index.ravel()[np.nanargmin(readings_s)])
     error = dead_path_error_um(index, first, dead_path_mm=dead_path_mm)
     size = float(np.nanmax(error) - np.nanmin(error))
-    message = f"The dead path of {dead_path_mm:g} mm is corrected for the logged air: {size:.2f} µm over the test."
     corrected = deviations.assign(deviation=deviations["deviation"] - error)
     corrected["deviation"].attrs.update(deviations["deviation"].attrs)
-    remedy = "Give the dead path a minus sign if the reflector moves towards the laser."
-    return corrected, [Notice("dead_path_corrected", message, remedy, size)]
+    return corrected, [Notice.of("dead_path_corrected", effect_um=size, dead_path_mm=dead_path_mm, size=size)]

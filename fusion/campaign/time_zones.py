@@ -75,11 +75,7 @@ def time_part(table: xr.Dataset, stated: str | None) -> TimePart | None:
 def zone_notices(table: xr.Dataset, *, code: str, of: str) -> Iterator[Notice]:
     """Yield the notice of times of day that nobody has given a zone."""
     if lacks_zone(table) and is_dated(table["time"].values):
-        yield Notice(
-            code,
-            f"The times of {of} carry no zone: they are shown as logged; results.json and the products take them as UTC.",
-            'Write the zone of the logged times under [campaign], such as time_zone = "Europe/Vienna".',
-        )
+        yield Notice.of("no_zone", code=code, of=of)
 
 
 def refuse_mixed_zones(tables: Mapping[str, xr.Dataset], *, source: str) -> None:

@@ -34,6 +34,7 @@ from fusion.campaign.time_zones import utc
 from fusion.pipeline.positioning import diagnose_positions, sites_of
 from fusion.results import store
 from fusion.results.loop import ResidualTestsPart
+from fusion.results.numbers import upper_first
 from fusion.results.progress import Report, counted
 from fusion.results.results import Notice, Outcome, Parts
 from fusion.results.store import joined
@@ -262,12 +263,7 @@ def gap_notices(readings: Readings) -> Iterator[Notice]:
         name, have = ", ".join(names), "has" if len(names) == 1 else "each have"
         minutes = sum(end_s - start_s for start_s, end_s in own) / 60.0
         first = own[0][0] / 60.0
-        yield Notice(
-            "series_gap",
-            f"{name} {have} {counted(len(own), 'gap')}, {minutes:.0f} min together, the first {first:.0f} min after the first reading; "
-            "taken as a straight line there, so that an effect that follows it is underestimated.",
-            f"Log {name} without a break, at least once a minute.",
-        )
+        yield Notice.of("series_gap", name=name, have=have, gaps=counted(len(own), "gap"), minutes=minutes, first=first)
 
 
 def library_for(source: Inputs) -> dict[str, Effect]:
@@ -287,12 +283,7 @@ def library_for(source: Inputs) -> dict[str, Effect]:
 def field_notices(errors: Sequence[FieldFault]) -> Iterator[Notice]:
     """Notices of camera errors that were taken out of the fields."""
     for one in errors:
-        yield Notice(
-            f"field_corrected_{one.effect}",
-            f"{one.text[0].upper()}{one.text[1:]}: removed from the frames, and the model was fitted again to the corrected fields. "
-            "Maps and correlation show the uncorrected fields.",
-            "Give the camera a reference patch, or shield it from warm bodies; the correction is loop_field_correction in fusion.nc.",
-        )
+        yield Notice.of("field_corrected", code=f"field_corrected_{one.effect}", text=upper_first(one.text))
 
 
 def join_fusion(

@@ -70,13 +70,7 @@ def estimate_joint(deviations: xr.Dataset) -> tuple[xr.Dataset | None, tuple[Not
         return estimate_drift(deviations), ()
     except NoScatterError:
         file = str(deviations.attrs.get("source", "the file of the readings"))
-        message = (
-            f"All or nearly all readings of {file} repeat exactly from cycle to cycle: their digits hide scatter and drift. "
-            "ISO 230-2 values are evaluated as they are; drift, positions that stand out and causes are not."
-        )
-        return None, (
-            Notice("no_scatter", message, "Write more digits, or read with an instrument of finer resolution."),
-        )
+        return None, (Notice.of("no_scatter", file=file),)
 
 
 def evaluate_standard(

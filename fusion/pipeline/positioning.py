@@ -84,12 +84,7 @@ def _approach_notices(deviations: xr.Dataset) -> Iterator[Notice]:
     read = deviations["deviation"].notnull().any(("cycle", "target"))
     sides = [str(name) for name in read["direction"].values[read.values]]
     if len(sides) == 1:
-        yield Notice(
-            "one_approach",
-            f"Positions were approached in the {sides[0]} direction only: unidirectional values are given; reversal error, bidirectional "
-            "values and the drift of the reversal need both.",
-            "Approach every position from both sides.",
-        )
+        yield Notice.of("one_approach", side=sides[0])
 
 
 def _scatter_notices(drift: xr.Dataset | None) -> Iterator[Notice]:
@@ -98,22 +93,10 @@ def _scatter_notices(drift: xr.Dataset | None) -> Iterator[Notice]:
         return
     sigma, step = float(drift["sigma"]), float(drift["resolution"])
     if sigma < step:
-        yield Notice(
-            "coarse_digits",
-            f"Readings are recorded in steps of {step:.3g} µm, more than their standard deviation of {sigma:.2g} µm: rounding alone makes "
-            "positions differ by up to a step, so that one that stands out by no more than that is not named.",
-            "Write more digits, or read with an instrument of finer resolution.",
-        )
+        yield Notice.of("coarse_digits", step=step, sigma=sigma)
     if not drift.attrs["scatter_undetermined"]:
         return
-    yield Notice(
-        "scatter_undetermined",
-        "The drift from one reading to the next is so large that the noise of the readings cannot be told from none. "
-        f"The scatter of {sigma:.2g} µm is no measured value, and the true one may be far smaller; uncertainties, outliers and positions "
-        "that stand out rest on it.",
-        "Let the machine come to rest before the test, or read the positions in quicker succession; check whether the readings were "
-        "averaged or smoothed before they were written.",
-    )
+    yield Notice.of("scatter_undetermined", sigma=sigma)
 
 
 def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset | None, zone: str | None) -> Iterator[Notice]:
@@ -126,21 +109,16 @@ def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset | None, zone: str
         of_all = f"{counted(int(gaps.sum()), 'reading')} of {gaps[:, approached].size} missing"
         missing = f"{of_all}, in {counted(len(cycles), 'cycle')}: {listed(cycles)}."
         if drift is None:
-            yield Notice("readings_missing", f"{missing} The values use the remaining readings.", remedy="")
+            yield Notice.of("readings_missing", missing=missing)
         else:
             share = np.sqrt(1.0 - gaps.mean(axis=0))
             wider = float(np.nanmax(drift["profile_u"].values * (1.0 - share)))
-            effect = f"This widens the profile's standard uncertainty by up to {wider:.3f} µm."
-            remaining = "The joint estimate allows for gaps; conventional values use the remaining readings."
-            yield Notice("readings_missing", f"{missing} {effect} {remaining}", remedy="", effect_um=wider)
+            yield Notice.of("readings_missing_jointly", code="readings_missing", effect_um=wider, missing=missing)
     outliers = (deviations["quality_flag"] & OUTLIER.mask) > 0
     if outliers.any():
         named = _names(outliers, deviations, zone)
-        yield Notice(
-            "outliers",
-            f"{counted(len(named), 'outlier')} down-weighted in the joint estimate: {listed(named)}. Conventional values "
-            "contain them.",
-            f"Compare {_file(deviations)} with the logs of machine and laser: {listed(named)}.",
+        yield Notice.of(
+            "outliers", outliers=counted(len(named), "outlier"), named=listed(named), file=_file(deviations)
         )
 
 
@@ -171,13 +149,7 @@ def _sensor_notices(fused: xr.Dataset) -> Iterator[Notice]:
     """Return the notice that contact sensors replace the camera, with what the line between them misses."""
     if "interpolation_u" in fused:
         missed, share = float(fused["interpolation_u"]), float(fused["axis_scale_u"])
-        yield Notice(
-            "sensors_for_the_camera",
-            "The rise along the axis comes from contact sensors, on a straight line from one to the next. A sensor is missed by the "
-            f"line through the others by {missed:.2g} K ({share:.0%} of the rise), which enters the uncertainty of every coefficient "
-            "per kelvin; a warm spot between the sensors is not seen.",
-            "Place sensors where the table warms most, evenly along the axis.",
-        )
+        yield Notice.of("sensors_for_the_camera", missed=missed, share=share)
 
 
 def _without_gross(deviations: xr.Dataset, zone: str | None) -> tuple[xr.Dataset, list[Notice]]:
@@ -187,11 +159,12 @@ def _without_gross(deviations: xr.Dataset, zone: str | None) -> tuple[xr.Dataset
         return deviations, []
     deviation, named = deviations["deviation"], _names(gross, deviations, zone)
     largest = float(np.abs(deviation.where(gross) - deviation.median("cycle")).max())
-    notice = Notice(
+    notice = Notice.of(
         "gross_readings",
-        f"{counted(int(gross.sum()), 'reading')} more than ten standard deviations of their position off, by up to {largest:.3g} µm: "
-        f"{listed(named)}; left out where drift and field are compared and modelled.",
-        f"Check {listed(named)} (beam, unit, typing error), and correct or remove these readings in {_file(deviations)}.",
+        readings=counted(int(gross.sum()), "reading"),
+        largest=largest,
+        named=listed(named),
+        file=_file(deviations),
     )
     return deviations.assign(deviation=deviation.where(~gross)), [notice]
 
@@ -219,11 +192,12 @@ def _gap_notices(fields: xr.Dataset, deviations: xr.Dataset) -> Iterator[Notice]
         return
     empty = fields["cycle"].values[~cycles_with_field(fields["temperature"])]
     without = f"; cycles without a frame: {listed(str(cycle) for cycle in empty)}" if empty.size else ""
-    yield Notice(
+    yield Notice.of(
         "frames_gaps",
-        f"{counted(len(gaps), 'gap')} between the frames: {listed(gap_words(gap) for gap in gaps)}{without}. The field of "
-        f"{counted(int(inside.sum()), 'reading')} in them is interpolated.",
-        "Give all frames of the test.",
+        gaps=counted(len(gaps), "gap"),
+        named=listed(gap_words(gap) for gap in gaps),
+        without=without,
+        readings=counted(int(inside.sum()), "reading"),
     )
 
 
@@ -310,11 +284,12 @@ def insufficient_for_model(deviations: xr.Dataset) -> Iterator[Notice]:
     """Return the notice that a test is too small for positions that stand out and for the closed loop; empty where it is not."""
     cycles, targets = deviations.sizes["cycle"], deviations.sizes["target"]
     if cycles < LEAST_CYCLES or targets < LEAST_TARGETS:
-        yield Notice(
+        yield Notice.of(
             "too_small_for_model",
-            f"{counted(cycles, 'cycle')} at {counted(targets, 'target')}: ISO 230-2, profile, scatter and drift are evaluated; positions "
-            f"that stand out, causes of drift and closed loop need at least {LEAST_CYCLES} cycles (better 50) at {LEAST_TARGETS} targets.",
-            f"Measure at least {LEAST_CYCLES} cycles, better 50, for the causes of the drift.",
+            cycles=counted(cycles, "cycle"),
+            targets=counted(targets, "target"),
+            least_cycles=LEAST_CYCLES,
+            least_targets=LEAST_TARGETS,
         )
 
 
@@ -325,12 +300,7 @@ def choose_targets(deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
         return deviations, []
     order = np.argsort(deviations["position"].values, kind="stable")
     chosen = np.sort(order[np.round(np.linspace(0, count - 1, MOST_TARGETS)).astype(int)])
-    notice = Notice(
-        "targets_chosen",
-        f"Positions that stand out and the closed loop use {MOST_TARGETS} of the {count} positions, evenly spread with both ends, "
-        "which know the drift as well; ISO 230-2, profile, scatter and drift use all.",
-        "",
-    )
+    notice = Notice.of("targets_chosen", most_targets=MOST_TARGETS, count=count)
     return deviations.isel(target=chosen), [notice]
 
 
@@ -351,12 +321,7 @@ def average_cycles(fused: xr.Dataset, field: xr.DataArray) -> tuple[xr.Dataset, 
     averaged["deviation"].attrs = fused["deviation"].attrs
     at_once = max(1, frames * together // cycles)
     of_frames = field if at_once == 1 else field.coarsen(time=at_once, boundary="trim").mean()
-    notice = Notice(
-        "cycles_averaged",
-        f"Field and drift are correlated by means of {together} successive cycles ({averaged.sizes['cycle']} of {cycles}): a part "
-        "that responds within less is seen as one that responds at once.",
-        "",
-    )
+    notice = Notice.of("cycles_averaged", together=together, cycle=averaged.sizes["cycle"], cycles=cycles)
     return averaged.assign_coords(cycle=averaged["cycle"].astype(int)), of_frames, [notice]
 
 
@@ -364,9 +329,4 @@ def insufficient_for_correlation(fields: xr.Dataset) -> Iterator[Notice]:
     """Return the notice that a test is too small for drift and field to be compared; empty where it is not."""
     frames = fields.sizes["time"]
     if frames < LEAST_FRAMES:
-        yield Notice(
-            "too_few_frames",
-            f"{counted(frames, 'frame')}: fields and hotspots are evaluated; which part of the field goes with the drift needs at least "
-            f"{LEAST_FRAMES} frames.",
-            "Take a frame in every cycle, or once a minute.",
-        )
+        yield Notice.of("too_few_frames", frames=counted(frames, "frame"), least_frames=LEAST_FRAMES)

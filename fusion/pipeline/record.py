@@ -68,20 +68,17 @@ def _held_notices(table: xr.Dataset) -> Iterator[Notice]:
     """Notices of logs with a line per change: how values were held between lines, and channels that were not connected."""
     for one in json.loads(table.attrs.get("held", "[]")):
         if "step_s" in one:
-            yield Notice(
+            yield Notice.of(
                 "record_values_held",
-                f"{one['file']} has a line for every change: a channel keeps its value until its next line, on rows every "
-                f"{duration(one['step_s'])} (as {one['fastest']} is logged). The longest time between two lines of a channel is "
-                f"{duration(one['wait_s'])} ({one['slowest']}). Where no channel has a line for {duration(one['longest_s'])}, "
-                "the log counts as interrupted.",
-                "Set the dead bands of the channels below their noise: a value that moves within its dead band looks constant, then late.",
+                file=one["file"],
+                step=duration(one["step_s"]),
+                fastest=one["fastest"],
+                wait=duration(one["wait_s"]),
+                slowest=one["slowest"],
+                longest=duration(one["longest_s"]),
             )
         if one["lost"]:
-            yield Notice(
-                "record_channels_lost",
-                f"Not connected in {one['file']}: {listed(one['lost'])}; no value from there to the next line of the channel.",
-                "Look at the connection of these channels; one that was never connected gives nothing to the record.",
-            )
+            yield Notice.of("record_channels_lost", file=one["file"], lost=listed(one["lost"]))
 
 
 def _unread_notices(table: xr.Dataset) -> Iterator[Notice]:
@@ -93,29 +90,20 @@ def _unread_notices(table: xr.Dataset) -> Iterator[Notice]:
     }
     named = [f"{name} ({count} of {table.sizes['time']})" for name, count in counts.items() if count]
     if named:
-        message = f"Samples without a reading: {listed(named)}. They are left out of the means over blocks."
-        yield Notice("record_readings_missing", message, "Look at contact and cable, or at record.missing.")
+        yield Notice.of("record_readings_missing", named=listed(named))
 
 
 def _rise_notices(table: xr.Dataset) -> Iterator[Notice]:
     """Notice of the temperatures that are rises."""
     if rises := json.loads(table.attrs.get("rises", "[]")):
-        yield Notice(
-            "record_rises",
-            f"{listed(rises)}: kelvins around zero are taken as a rise of the temperature, not as a temperature.",
-            "",
-        )
+        yield Notice.of("record_rises", rises=listed(rises))
 
 
 def _set_point_notices(health: SensorHealth) -> Iterator[Notice]:
     """Notice of the set points, and of what each regulates."""
     if health.set_points:
         named = listed(f"{name} (of {sensor})" for name, sensor in health.set_points.items())
-        yield Notice(
-            "record_set_points",
-            f"Set points by their course, which act as drivers: {named}. Heating up, overshoot and holding are no faults of a sensor.",
-            "",
-        )
+        yield Notice.of("record_set_points", named=named)
 
 
 def guess_notices(campaign: Campaign) -> Iterator[Notice]:
@@ -124,12 +112,7 @@ def guess_notices(campaign: Campaign) -> Iterator[Notice]:
         units = {key: getattr(record, key) for key in ("time_unit", "time_format", "date_order", "start")}
         units |= {name: column.unit for name, column in record.columns.items()}
         named = listed(f"{name} = {units.get(name) or 'not stated'}" for name in record.guessed)
-        yield Notice(
-            "units_guessed",
-            f"Assumed, because the table does not state it and its values suggest it: {named}. Another unit changes every time constant, "
-            "temperature or displacement by its factor, another order or start the dates.",
-            "Look it up at the logger, correct it where it is another, and remove it from record.guessed.",
-        )
+        yield Notice.of("units_guessed", named=named)
 
 
 def model_record(source: RecordSource, *, report: Report) -> Outcome:
@@ -162,12 +145,7 @@ def digit_notices(result: RecordResult) -> Iterator[Notice]:
     ]
     if named:
         told = [f"{name} {um:.3g} µm" for name, um, one in zip(record.channels, step, hidden, strict=True) if one]
-        yield Notice(
-            "coarse_digits",
-            f"Readings are recorded in coarse digits: {listed(named)}. Rounding moves displacements in steps of {listed(told)}; an effect "
-            "that moves none by more than a step is not named, and no shape is stated of what is left within half a step.",
-            "Write more digits, or read with an instrument of finer resolution.",
-        )
+        yield Notice.of("record_coarse_digits", code="coarse_digits", named=listed(named), told=listed(told))
 
 
 def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
@@ -178,14 +156,9 @@ def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
     dropped = [name for name in declared if name in {"axis_expansion", "table_offset"}]
     if not dropped:
         return list(declared), []
-    message = (
-        f"{listed(dropped)} need positions along an axis, which a record does not have; its declared model is {QUASI_STATIC}: "
-        "every displacement linear in the temperatures."
-    )
-    remedy = f'Write declared = ["{QUASI_STATIC}"] under [model], or leave [model] out.'
     kept = [name for name in declared if name not in dropped]
     return [QUASI_STATIC, *(name for name in kept if name != QUASI_STATIC)], [
-        Notice("declared_without_axis", message, remedy)
+        Notice.of("declared_without_axis", dropped=listed(dropped), model=QUASI_STATIC)
     ]
 
 
@@ -203,10 +176,13 @@ def sensor_notices(health: SensorHealth) -> Iterator[Notice]:
             f"{with_it} with it, {without} without."
         )
         if one.computed_with:
-            yield Notice(
+            yield Notice.of(
                 "record_displacement_computed",
-                f"{finding}; {one.reason or 'it is left out'}. {asked.format(of=f' with {one.computed_with}')}",
-                f"Log {one.sensor} without its correction by temperature, or end the record before {one.computed_with} fails.",
+                finding=finding,
+                reason=one.reason or "it is left out",
+                asked=asked.format(of=f" with {one.computed_with}"),
+                sensor=one.sensor,
+                computed_with=one.computed_with,
             )
         elif one.state != "suspected":
             times = listed(
@@ -222,79 +198,43 @@ def sensor_notices(health: SensorHealth) -> Iterator[Notice]:
                 f"{look}.",
             )
         else:
-            yield Notice(
-                "record_sensor_suspected",
-                f"{finding}. It is suspected only ({one.reason}), and stays in the model.",
-                f"{look}; take it out of record.temperatures if it is faulty.",
-            )
+            yield Notice.of("record_sensor_suspected", finding=finding, reason=one.reason, look=look)
 
 
 def record_notices(record: Record) -> Iterator[Notice]:
     """Notices of gaps and pauses, of sensors that depend on the others, and of drivers that were not logged."""
     if record.runs:
-        yield Notice(
-            "record_runs",
-            f"{counted(len(record.runs), 'run')} in the order {listed(one.name for one in record.runs)}: displacements and rises count "
-            "from the first block of each run, and no state is carried over between runs.",
-            "",
+        yield Notice.of(
+            "record_runs", runs=counted(len(record.runs), "run"), named=listed(one.name for one in record.runs)
         )
     yield from _sample_notices(record)
     if record.unusable:
         named = [f"{name} {fault}" for name, fault in record.unusable.items()]
-        message = f"Displacements that cannot be modelled are left out: {listed(named)}."
-        yield Notice("record_channels_left_out", message, "Look at their probes and inputs.")
+        yield Notice.of("record_channels_left_out", named=listed(named))
     if record.duplicates:
-        yield Notice(
-            "record_sensors_dependent",
-            f"Left out because they duplicate other sensors: {listed(record.duplicates)}.",
-            "Name each sensor once under record.temperatures.",
-        )
+        yield Notice.of("record_sensors_dependent", duplicates=listed(record.duplicates))
     if record.constant_drivers:
-        yield Notice(
-            "constant_drivers",
-            f"Constant over the whole test: {listed(record.constant_drivers)}. How the machine responds to it is not known, so that a "
-            "prediction holds at that load alone.",
-            "Vary it in a test: thermofuse plan proposes when.",
-        )
+        yield Notice.of("constant_drivers", constant_drivers=listed(record.constant_drivers))
     elif not record.drivers:
-        yield Notice(
-            "no_drivers",
-            "The record has no driver that changes, so a heat source that no sensor sees cannot be distinguished from a drift.",
-            "Log spindle speed, load or duty in the same table, and give its column the role driver under [record.columns].",
-        )
+        yield Notice.of("no_drivers")
 
 
 def _sample_notices(record: Record) -> Iterator[Notice]:
     """Notices of samples that are missing or impossible, and of pauses."""
     if record.gaps:
         named = [f"{name} ({counted(number, 'block')})" for name, number in record.gaps.items()]
-        yield Notice(
-            "record_gaps",
-            f"Blocks of {record.block_s:.4g} s without a value were interpolated: {listed(named)}.",
-            "Look at the logger; effects that act within the gaps cannot be seen.",
-        )
+        yield Notice.of("record_gaps", block_s=record.block_s, named=listed(named))
     if record.impossible:
         named = [f"{name} ({counted(number, 'sample')})" for name, number in record.impossible.items()]
-        yield Notice(
-            "record_impossible_values",
-            f"Samples beyond what can be measured count as missing: {listed(named)}.",
-            "Look at the logger and at the units in the heading: it writes such numbers for missing values.",
-        )
+        yield Notice.of("record_impossible_values", named=listed(named))
     pauses = np.concatenate([np.diff(run.seconds) for run in record.series(record.seconds, "s").runs()])
     pauses = pauses[pauses > 1.5 * record.block_s]
     if pauses.size:
-        yield Notice(
-            "record_pauses",
-            f"Nothing was logged in {counted(pauses.size, 'pause')}, the longest {duration(float(pauses.max()))}; pauses are left out "
-            "and drivers interpolated linearly across them.",
-            "",
-        )
+        yield Notice.of("record_pauses", pauses=counted(pauses.size, "pause"), longest=duration(float(pauses.max())))
     missing = int(np.isnan(record.displacement).sum())
     if missing:
-        yield Notice(
-            "record_displacements_missing",
-            f"{counted(missing, 'block mean')} of {record.displacement.size} of the displacements missing; left out of every fit.",
-            "",
+        yield Notice.of(
+            "record_displacements_missing", block_means=counted(missing, "block mean"), size=record.displacement.size
         )
 
 

@@ -133,9 +133,8 @@ def note_changes(before: Mapping[str, FileState], after: Mapping[str, FileState]
         if names
     ]
     if words:
-        altered = f"Input files were altered while the run read them: {'; '.join(words)}."
-        remedy = "Wait until the recording has ended and run again."
-        yield Notice("inputs_changed", f"{altered} The products may mix both versions.", remedy)
+        altered = "; ".join(words)
+        yield Notice.of("inputs_changed", altered=altered)
 
 
 def refuse_other_campaign(folder: Path, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]]) -> None:

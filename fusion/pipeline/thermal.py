@@ -347,18 +347,10 @@ def repeat_notices(repeated: NDArray[np.bool_], times: Sequence[np.datetime64] |
     """Return one notice for frames that the camera wrote twice."""
     flags = find_repeats(repeated, np.array(times, "datetime64[ms]"))
     if flags:
-        yield Notice(
-            "frames_repeated",
-            f"The camera wrote frames more than once: {listed(f'{utc(flag.time)}: {flag.message}' for flag in flags)}.",
-            "Compare the times of the frames with the camera's own list; a frozen output shows no change of temperature.",
-        )
+        yield Notice.of("frames_repeated", named=listed(f"{utc(flag.time)}: {flag.message}" for flag in flags))
 
 
-_NO_SURROUNDINGS = Notice(
-    "camera_unchecked",
-    "Only the table is in view, so that steps and drift of the camera's zero cannot be distinguished from its warming.",
-    "Leave a margin around the table in view.",
-)
+_NO_SURROUNDINGS = Notice.of("camera_unchecked")
 
 
 def _correction_notices(
@@ -367,27 +359,14 @@ def _correction_notices(
     """Return one notice each for steps, for a drift, and for what cannot be distinguished."""
     if correction.steps:
         named = [f"{step.value_K:+.2f} K at {utc(frames[step.index].time)}" for step in correction.steps]
-        yield Notice(
-            "camera_steps_corrected",
-            f"{counted(len(correction.steps), 'step')} of the camera's zero (flat-field correction, FFC) removed from all later "
-            f"frames: {listed(named)}. The correction is uncertain by up to {u_K:.2g} K.",
-            "Let the camera warm up before the test, and make its flat-field corrections between the cycles.",
+        yield Notice.of(
+            "camera_steps_corrected", steps=counted(len(correction.steps), "step"), named=listed(named), u_K=u_K
         )
     if correction.drift_K.any():
-        yield Notice(
-            "camera_drift_corrected",
-            f"A drift of the camera's zero of {np.ptp(correction.drift_K):.2f} K, as the {shown_by} shows it, was removed.",
-            "Switch the camera on an hour before the test.",
-        )
+        yield Notice.of("camera_drift_corrected", drift_K=np.ptp(correction.drift_K), shown_by=shown_by)
     unexplained = float(np.abs(correction.unexplained_K).max())
     if u_K > _NAMED_U_K:
-        yield Notice(
-            "camera_drift_undetermined",
-            f"The surroundings of the table changed by {unexplained:.2f} K, which neither a logged air temperature nor "
-            "the camera explains. A drift of the camera of this size cannot be distinguished from warming; rises are uncertain by up to "
-            f"{u_K:.2g} K.",
-            "Log the air temperature, and keep a surface of constant temperature in view.",
-        )
+        yield Notice.of("camera_drift_undetermined", unexplained=unexplained, u_K=u_K)
 
 
 # Radiometry of a campaign: parameters and their uncertainties, surfaces with an emissivity of their own, total
@@ -609,7 +588,7 @@ def _edge_notices(edge: NDArray[np.bool_], regions: list[EmissivityRegion]) -> I
     if regions:
         named = ", ".join(region.outline.name for region in regions)
         count = counted(int(edge.sum()), "cell")
-        yield Notice("surface_edges", f"{count} at the edges of {named} see two surfaces and were left empty.", "")
+        yield Notice.of("surface_edges", count=count, named=named)
 
 
 #: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
@@ -766,19 +745,10 @@ def clock_notices(clock: ClockOffset) -> Iterator[Notice]:
     """Return a notice where the offset of the clocks is one of several that a periodic test shows."""
     if clock.rivals_s:
         others = listed(f"{offset:.1f} s" for offset in clock.rivals_s)
-        yield Notice(
-            "clock_offset_periodic",
-            f"The motion repeats: clock offsets of {others} fit about as well as {clock.offset_s:.1f} s, which is the smallest and was "
-            "taken as an assumption.",
-            "Write thermography.clock_offset if the clocks may be further apart, or film from before the first reading to after the last.",
-        )
+        yield Notice.of("clock_offset_periodic", others=others, offset_s=clock.offset_s)
 
 
-_ASSUMED_CLOCK = Notice(
-    "clock_offset_assumed",
-    "The clock offset is not given and frames of a still table cannot show it: 0 s was assumed.",
-    'Write thermography.clock_offset = "0 s" if both clocks were set by the same time server, or the offset that was noted.',
-)
+_ASSUMED_CLOCK = Notice.of("clock_offset_assumed")
 
 
 def _bounds(source: CameraInputs, offset_s: float) -> np.ndarray:
@@ -806,11 +776,7 @@ def _clipped_notices(fields: xr.Dataset, detector: Detector, parameters: CameraP
         if cells
         else "none of the plan"
     )
-    yield Notice(
-        "counts_clipped",
-        f"Many pixels share one count: clipped {where}. Their temperature is not known: {lost}.",
-        "Choose a range of the camera, or of the conversion, that includes what is seen.",
-    )
+    yield Notice.of("counts_clipped", where=where, lost=lost)
 
 
 def pixel_notices(flags: np.ndarray, treatment: str) -> Iterator[Notice]:
@@ -819,11 +785,7 @@ def pixel_notices(flags: np.ndarray, treatment: str) -> Iterator[Notice]:
         kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
         counts_by_kind = {name: int(np.count_nonzero(flags & flag)) for name, flag in kinds.items()}
         named = ", ".join(f"{count} {name}" for name, count in counts_by_kind.items() if count)
-        yield Notice(
-            "bad_pixels",
-            f"Pixels that do not follow their neighbours: {np.count_nonzero(flags)} ({named}); they {treatment}.",
-            "Have the camera replace its bad pixels (a one-point correction, or its maker's service).",
-        )
+        yield Notice.of("bad_pixels", pixels=np.count_nonzero(flags), named=named, treatment=treatment)
 
 
 def _registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
@@ -900,54 +862,31 @@ def _registration_notices(registration: Registration) -> Iterator[Notice]:
     if optics.spread_px > _SHARP_PX:
         middle = np.mean([(disc.x_mm, disc.y_mm) for disc in registration.fiducials.values()], axis=0)
         lost_mm = registration.margin_px / float(registration.projection.px_per_mm(middle))
-        yield Notice(
+        yield Notice.of(
             "frames_blurred",
-            f"The discs are blurred by {optics.spread_px:.1f} ± {optics.spread_u_px:.1g} px (standard deviation; "
-            f"focused: up to {_SHARP_PX:g} px): {lost_mm:.1f} mm around every disc and along the plan's edge are left out of the fields.",
-            "Focus the camera on the table; what is smaller than this is too low in the fields.",
+            spread_px=optics.spread_px,
+            spread_u_px=optics.spread_u_px,
+            focused_px=_SHARP_PX,
+            lost_mm=lost_mm,
         )
     if registration.left_out:
         named = "; ".join(f"{name}: {reason}" for name, reason in registration.left_out.items())
-        yield Notice(
-            "fiducials_left_out",
-            f"{counted(len(registration.left_out), 'fiducial')} or hints not used: {named}.",
-            "Correct the list of fiducials, or clean and repaint the discs; the registration rests on the others.",
-        )
+        yield Notice.of("fiducials_left_out", fiducials=counted(len(registration.left_out), "fiducial"), named=named)
 
 
-#: Attributes of the fields that list frames: sentence that follows their number, remedy.
-_FRAME_ATTRIBUTES = {
-    "frames_outside_cycles": (
-        "belong to no cycle, normal unless the clocks disagree; used for the field at the time of a reading, not in cycle averages",
-        "",
-    ),
-    "knocks": (
-        "show that the table moved and did not return; the plan was registered again from there on",
-        "Fasten camera and table, and check what happened at that time.",
-    ),
-    "frames_shaken": ("are displaced singly and were left out", "Shield the camera from vibration."),
-    "frames_obstructed": (
-        "differ from those before and after them as if an object were in front of the table, and were left out",
-        "Keep hands, trays and doors out of the view while a frame is taken.",
-    ),
-    "frames_unplaced": (
-        "do not show where the table is and were left out",
-        "Keep at least three fiducials in view at every axis position.",
-    ),
-    "frames_unchecked": (
-        "have too little contrast to show whether camera or table moved; a displacement would show in the next frame that has more",
-        "",
-    ),
-}
+#: Attributes of the fields that list frames, and codes of what is said of them.
+_FRAME_ATTRIBUTES = (
+    "frames_outside_cycles", "knocks", "frames_shaken", "frames_obstructed", "frames_unplaced", "frames_unchecked",
+)  # fmt: skip
 
 
 def _frame_notices(fields: xr.Dataset) -> Iterator[Notice]:
     """Return one notice for each kind of frame that the reduction reports."""
-    for name, (text, remedy) in _FRAME_ATTRIBUTES.items():
+    for name in _FRAME_ATTRIBUTES:
         frames = json.loads(fields.attrs.get(name, "[]"))
         if frames:
             named = listed([frame if isinstance(frame, str) else _words(frame) for frame in frames])
-            yield Notice(name, f"{counted(len(frames), 'frame')} {text}: {named}.", remedy)
+            yield Notice.of(name, frames=counted(len(frames), "frame"), named=named)
 
 
 def _words(value: Any) -> str:

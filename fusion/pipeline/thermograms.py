@@ -319,10 +319,8 @@ def _cut_notices(regions: Iterable[Region], shape: tuple[int, int]) -> Iterator[
     """Return a notice for regions of which a part is evaluated."""
     if cut := [region.name for region in regions if region.is_cut(shape)]:
         rows, columns = shape
-        yield Notice(
-            "regions_cut",
-            f"Partly outside the picture of {columns} x {rows} px, and evaluated within it: {listed(cut)}.",
-            f"Place {listed(cut)} within columns 0 to {columns - 1} and rows 0 to {rows - 1}.",
+        yield Notice.of(
+            "regions_cut", columns=columns, rows=rows, cut=listed(cut), last_column=columns - 1, last_row=rows - 1
         )
 
 
@@ -358,29 +356,11 @@ def _scene_notices(source: CameraInputs, part: schema.ThermogramsPart) -> Iterat
     others = part.pictures - len(source.frames)
     if part.scene == "no series":
         cameras = counted(len(part.cameras), "camera")
-        yield Notice(
-            "no_series",
-            f"{counted(part.pictures, 'picture')} of {cameras} are no series: each is evaluated, none is compared with another.",
-            "Put the pictures of one camera and one scene into a folder of their own to see what changes.",
-        )
+        yield Notice.of("no_series", pictures=counted(part.pictures, "picture"), cameras=cameras)
     elif others:
-        yield Notice(
-            "other_pictures",
-            f"{counted(others, 'picture')} of another camera or size, or without a time: evaluated one by one, no part of "
-            f"the series of {part.series}.",
-            "",
-        )
+        yield Notice.of("other_pictures", pictures=counted(others, "picture"), series=part.series)
     if part.scene == "moved":
-        yield Notice(
-            "picture_moved",
-            f"The picture shifts by up to {part.largest_shift_px:.1f} px: the difference is taken after bringing the last picture onto "
-            "the first; regions stay where they are in the picture, and may show another part of the scene.",
-            "Fasten the camera.",
-        )
+        yield Notice.of("picture_moved", largest_shift_px=part.largest_shift_px)
     elif part.scene == "unlike":
         taken = "the difference of the two is taken pixel by pixel" if part.difference else "no difference is taken"
-        yield Notice(
-            "pictures_unlike",
-            f"Some pictures have too little in common to show whether the camera stayed where it was: {taken}.",
-            "Fasten the camera, and put pictures of one scene into a folder of their own.",
-        )
+        yield Notice.of("pictures_unlike", taken=taken)

@@ -46,10 +46,8 @@ def left_out_notices(dataset: Read, code: str) -> list[Notice]:
     from fusion.results.results import Notice  # loads numpy: progress is shown before
 
     return [
-        Notice(
-            code,
-            f"{counted(len(named), noun)} of {path} left out: {listed(named)}.",
-            f"Correct these {noun}s in {path} and run again; the estimates allow for the gaps.",
+        Notice.of(
+            "lines_left_out", code=code, left_out=counted(len(named), noun), path=path, named=listed(named), noun=noun
         )
         for name, noun in (("left_out", "line"), ("marks", "reading"))
         for path, named in _lines_by_file(dataset, name)
@@ -61,11 +59,7 @@ def clock_notices(dataset: Read) -> list[Notice]:
     from fusion.results.results import Notice  # as above
 
     return [
-        Notice(
-            "clock_goes_back",
-            f"The clock of {path} goes back {counted(len(named), 'time')}: {listed(named)}. These rows are sorted by their times.",
-            f"Correct the times of {path}, or give what was logged before and after in files of its own.",
-        )
+        Notice.of("clock_goes_back", path=path, times=counted(len(named), "time"), named=listed(named))
         for path, named in _lines_by_file(dataset, "clock")
     ]
 

@@ -44,6 +44,7 @@ from fusion.results.parts import (
     TimePart,
 )
 from fusion.results.store import Product, plain, require_own
+from thermofuse.resources import vocabulary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,6 +132,13 @@ class Notice:
     message: Annotated[str, Field(description="One sentence with counts and names, for people.")]
     remedy: Annotated[str, Field(description="What would remove the warning; empty where nothing has to be done.")]
     effect_um: Annotated[Number, Field(description="Size of the effect on the drift, um; null where not known.")] = None
+
+    @classmethod
+    def of(cls, words: str, *, code: str = "", effect_um: float | None = None, **facts: object) -> Notice:
+        """Return the notice whose words stand in ``data/vocabulary/notices.toml`` by its code, with the facts of a run."""
+        said = vocabulary("notices")[words]
+        message, remedy = (said.get(part, "").format(effect_um=effect_um, **facts) for part in ("message", "remedy"))
+        return cls(code or words, message, remedy, effect_um)
 
 
 def _loop_tag(loop: Any) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import json
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import jsonschema
@@ -13,10 +15,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from fusion.pipeline.thermal import _FRAME_ATTRIBUTES
 from fusion.results.loop import AxisLoop, Coefficient, RecordLoop
 from fusion.results.results import Notice, Results, ResultsError, assemble, read_results, results_schema
 from fusion.results.store import plain
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
+from thermofuse.resources import vocabulary
 
 pytestmark = pytest.mark.long
 
@@ -212,3 +216,21 @@ def test_results_of_a_folder_show_their_report(tmp_path):
     report = results.of_folder(tmp_path).report()
     assert report.path == tmp_path / "report.html" and results == assemble("A", PARTS, [])
     assert 'srcdoc="&lt;p class=&quot;a&quot;&gt;R &amp; D&lt;/p&gt;"' in report._repr_html_()
+
+
+def test_every_notice_finds_its_words_and_gives_all_their_facts() -> None:
+    """A fact that is lacking would end a run in its notice, and words that no notice takes are said by nobody."""
+    words, said = vocabulary("notices"), {*_FRAME_ATTRIBUTES}
+    for path in Path("fusion").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if (
+                isinstance(node, ast.Call)
+                and ast.unparse(node.func) == "Notice.of"
+                and isinstance(node.args[0], ast.Constant)
+            ):
+                name = str(node.args[0].value)
+                said.add(name)
+                needed = {fact for text in words[name].values() for _, fact, _, _ in Formatter().parse(text) if fact}
+                given = {keyword.arg for keyword in node.keywords} - {"code", "effect_um"}
+                assert needed - {"effect_um"} == given, f"{path}, line {node.lineno}"
+    assert said == {*words}
