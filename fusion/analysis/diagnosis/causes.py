@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fusion.results.axis import Cause
+from thermofuse.resources import vocabulary
 
 
 @dataclass(frozen=True)
@@ -21,43 +21,18 @@ class CauseRecord:
     check: str
 
 
-CAUSES: dict[Cause, CauseRecord] = {
-    "structural": CauseRecord(
-        "mechanical scatter",
-        "Inspect guideway, scale, screw and nut at this position for preload, wear, contamination and looseness; repeat the "
-        "test with small steps around it.",
-    ),
-    "local_temperature": CauseRecord(
-        "local temperature",
-        "Find what heats the table near this position (drive, pipe, chips, sun) and whether the fixture bends with it; repeat "
-        "the test with that source switched on and off.",
-    ),
-    "stick_slip": CauseRecord(
-        "stick-slip",
-        "Inspect lubrication, seals, wipers and the drive's gain at low speed around this position; repeat the test at another "
-        "feed rate and after lubrication.",
-    ),
-    "step": CauseRecord(
-        "sudden step",
-        "Inspect fixture, optics, clamps and the coupling of the scale, and look for an event at that time in the machine's log.",
-    ),
-    "link": CauseRecord(
-        "jump between two positions",
-        "Inspect what carries the motion from the position before to this position: nut and screw (play, preload, a slip), coupling, and "
-        "the joints of the scale and of its reading head; repeat the test with small steps between the two.",
-    ),
-    "undetermined": CauseRecord(
-        "undetermined",
-        "These data do not decide: repeat the test with more cycles in both directions, a varied duty cycle and a temperature "
-        "sensor at this position.",
-    ),
-}
+CAUSES = {name: CauseRecord(**words) for name, words in vocabulary("diagnosis")["causes"].items()}
 
 
 def undetermined_check(leading: str) -> str:
     """Return what to do where no cause is named, and what to inspect if the leading explanation, unless it is none, holds after all."""
     generic = CAUSES["undetermined"].check
-    candidate = None if leading == "undetermined" else CAUSES.get(leading)  # type: ignore[call-overload]
+    candidate = None if leading == "undetermined" else CAUSES.get(leading)
     if candidate is None:
         return generic
     return f"{generic} If the cause is {candidate.words}: {candidate.check[0].lower()}{candidate.check[1:]}"
+
+
+def say(evidence: str, **numbers: object) -> str:
+    """Return a sentence of the evidence for or against a cause."""
+    return str(vocabulary("diagnosis")["evidence"][evidence].format(**numbers))

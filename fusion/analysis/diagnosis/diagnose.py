@@ -17,7 +17,7 @@ import xarray as xr
 from scipy import special
 
 from fusion.analysis.alignment.readings import check_readings, known_mean
-from fusion.analysis.diagnosis.causes import CAUSES, undetermined_check
+from fusion.analysis.diagnosis.causes import CAUSES, say, undetermined_check
 from fusion.analysis.diagnosis.explanations import (
     LAGS_S,
     DiagnosisError,
@@ -194,15 +194,12 @@ def diagnose_link(fused: xr.Dataset, link: Flagged) -> Diagnosis:
     probability = float(special.expit(jumps.gain_nats))
     against = []
     if probability < THRESHOLDS["link"]:
-        against.append(
-            f"scatter of target {before} or {link.target} alone fits nearly as well (probability {1.0 - probability:.2f})"
-        )
+        against.append(say("link_or_scatter", before=before, target=link.target, probability=1.0 - probability))
     if jumps.serial_p < LINK_COURSE_LEVEL:
-        against.append(
-            f"the jumps have a course in time (serial p = {jumps.serial_p:.2g}): what grows between the two targets, as their temperature"
-        )
+        against.append(say("link_has_a_course", p=jumps.serial_p))
     cause: Cause = "undetermined" if against else "link"
     ratios = link_ratios(fused, link.target, link.direction)
+    size = {"size": jumps.size_um, "expanded_u": 2.0 * jumps.size_u_um}
     return Diagnosis(
         target=link.target,
         direction=link.direction,
@@ -216,9 +213,8 @@ def diagnose_link(fused: xr.Dataset, link: Flagged) -> Diagnosis:
             **dict(zip(("link_before_ratio", "link_after_ratio"), ratios, strict=True)),
         },
         for_it=(
-            f"every target from {link.target} on jumps together against those up to {before}, by {jumps.size_um:.2f} ± "
-            f"{2.0 * jumps.size_u_um:.2f} µm (standard deviation from pass to pass, k = 2), beside shift and stretch of the pass",
-            f"scatter of one of the two targets gains {jumps.gain_nats:.1f} nats less",
+            say("link_jumps", target=link.target, before=before, **size),
+            say("link_gain", nats=jumps.gain_nats),
             _links_sentence(before, ratios),
         ),
         against_it=tuple(against),
@@ -244,8 +240,7 @@ def link_ratios(fused: xr.Dataset, target: int, direction: str) -> tuple[float |
 def _links_sentence(before: int, ratios: tuple[float | None, float | None]) -> str:
     """Return which of the two links of a target equation (6) shows raised."""
     own, other = ratios
-    behind = "" if other is None else f"; to the one behind {other:.2f} times: a target that scatters raises both alike"
-    return f"differences to target {before} scatter {own:.2f} times as much as those of neighbours usually do{behind}"
+    return say("links", before=before, own=own) + ("" if other is None else say("link_behind", other=other))
 
 
 def _fit_explanations(fused: xr.Dataset, target: int, flagged: set[int], seed: int) -> _Case:
@@ -305,11 +300,8 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
     cause: Cause = "undetermined" if against or leading == "slow" else leading  # type: ignore[assignment]
     others = [name for name in probability if name != leading and name not in case.excluded]
     runner_up = max(others, key=lambda name: probability[name])
-    against.append(f"next best explanation: {_in_words(runner_up)}, probability {probability[runner_up]:.2f}")
-    against += [
-        f"{_in_words(name)}: excluded, since ordinary slow drift would look the same (p = {case.tested[name].p_value:.2g})"
-        for name in case.excluded
-    ]
+    against.append(say("next_best", name=_in_words(runner_up), probability=probability[runner_up]))
+    against += [say("excluded", name=_in_words(name), p=case.tested[name].p_value) for name in case.excluded]
     return Diagnosis(
         target=case.residual.target,
         direction=direction,
@@ -324,7 +316,7 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
 
 def _in_words(explanation: str) -> str:
     """Return the name of an explanation in words; a random walk is no cause."""
-    return "random walk" if explanation == "slow" else CAUSES[explanation].words  # type: ignore[index]
+    return "random walk" if explanation == "slow" else CAUSES[explanation].words
 
 
 def _objections(case: _Case, leading: str, probability: float) -> list[str]:
@@ -332,73 +324,52 @@ def _objections(case: _Case, leading: str, probability: float) -> list[str]:
     reasons = []
     threshold = THRESHOLDS.get(leading, 0.0)
     if probability < threshold:
-        reasons.append(f"probability {probability:.2f} of {_in_words(leading)} is below its threshold {threshold:.2f}")
+        reasons.append(say("improbable", probability=probability, name=_in_words(leading), threshold=threshold))
     fit = case.tested.get(leading)
     if fit is not None and fit.hold_out_gain <= 0:
-        reasons.append(
-            f"the fit to one direction does not predict the other (hold-out log-likelihood {fit.hold_out_gain:+.1f} nats)"
-        )
+        reasons.append(say("not_predicted", nats=fit.hold_out_gain))
     if leading == "local_temperature" and case.temperature is not None:
         positive, negative = case.temperature.by_direction
         if positive * negative < 0:
-            reasons.append(f"the sign differs between directions ({positive:+.3f} and {negative:+.3f} µm/K)")
+            reasons.append(say("signs_differ", positive=positive, negative=negative))
         if case.warm_up_share >= WARM_UP_SHARE:
-            reasons.append(
-                f"{case.warm_up_share:.1%} of the local temperature's variance is one warm-up curve: collinear with any other slow cause"
-            )
+            reasons.append(say("one_warm_up", share=case.warm_up_share))
     if leading == "slow":
-        reasons.append(f"slow (serial p = {case.serial_p:.2g}), but neither local temperature nor a step explains it")
+        reasons.append(say("slow", p=case.serial_p))
     return reasons
 
 
 def _support(case: _Case, leading: str) -> list[str]:
     """Return the sentences in favour of the leading explanation."""
-    residual = case.residual
-    scatter = float(np.nanstd(residual.values))
-    sentences = [
-        f"standard deviation {scatter:.2f} µm over both approaches, typical of the other positions {residual.typical_um:.2f} µm"
-    ]
-    if leading == "step":
-        fit = case.step
-        sentences.append(
-            f"step of {fit.coefficient:+.2f} ± {2.0 * fit.coefficient_u:.2f} µm (k = 2) at cycle {case.step_cycle} "
-            f"(p = {fit.p_value:.2g}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
-        )
-    elif leading == "local_temperature" and case.temperature is not None:
-        fit = case.temperature
-        sentences.append(
-            f"{fit.coefficient:+.3f} ± {2.0 * fit.coefficient_u:.3f} µm per K (k = 2) of local temperature rise, "
-            f"lag {LAGS_S[fit.best]:.0f} s (p = {fit.p_value:.2g}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
-        )
+    residual, fit = case.residual, case.tested.get(leading)
+    sentences = [say("scatter", scatter=float(np.nanstd(residual.values)), typical=residual.typical_um)]
+    if fit is not None:
+        size = {"size": fit.coefficient, "expanded_u": 2.0 * fit.coefficient_u, "p": fit.p_value}
+        lag = np.nan if case.temperature is None else LAGS_S[case.temperature.best]
+        sentences.append(say(leading, cycle=case.step_cycle, lag=lag, nats=fit.hold_out_gain, **size))
     elif leading == "stick_slip":
-        positive, negative = residual.scatter_um
-        sentences += [
-            f"standard deviation {positive:.2f} µm in the positive direction, {negative:.2f} µm in the negative direction",
-            f"scatter that depends on the direction of approach raises the log-likelihood by {case.approach_gain:+.1f} nats",
-        ]
+        sentences += [_directions("both_directions", residual), say("approach", nats=case.approach_gain)]
     elif leading == "structural":
-        sentences += [_serial_sentence(case.serial_p), _directions_sentence(residual)]
+        sentences.append(say("not_serial" if case.serial_p > SERIAL_LEVEL else "serial", p=case.serial_p))
+        sentences.append(_directions(_agreement(residual), residual))
     return sentences
 
 
-def _serial_sentence(p_value: float) -> str:
-    """Return what the order of the readings in time shows."""
-    if p_value > SERIAL_LEVEL:
-        return f"no significant serial correlation (p = {p_value:.2g})"
-    return f"serial correlation p = {p_value:.2g}"
-
-
-def _directions_sentence(residual: Residual) -> str:
-    """Return the standard deviations of both directions, and whether they agree within their expanded uncertainty (k = 2)."""
+def _directions(words: str, residual: Residual) -> str:
+    """Return a sentence on the standard deviations of both directions."""
     positive, negative = residual.scatter_um
+    return say(words, positive=positive, negative=negative)
+
+
+def _agreement(residual: Residual) -> str:
+    """Return whether the standard deviations of both directions agree within their expanded uncertainty (k = 2)."""
     freedom = np.isfinite(residual.values).sum(axis=1) - 1
     if (freedom < 1).any():
-        return "directions not compared: fewer than two readings in one of them"
-    numbers = f"{positive:.2f} µm in the positive direction, {negative:.2f} µm in the negative direction"
+        return "not_compared"
+    positive, negative = residual.scatter_um
     u_positive, u_negative = np.array([positive, negative]) / np.sqrt(2.0 * freedom)
-    if abs(positive - negative) <= 2.0 * np.hypot(u_positive, u_negative):
-        return f"standard deviations equal within their uncertainty: {numbers}"
-    return f"standard deviation {numbers}"
+    agree = abs(positive - negative) <= 2.0 * np.hypot(u_positive, u_negative)
+    return "equal_directions" if agree else "both_directions"
 
 
 def _evidence(case: _Case, probability: dict[str, float]) -> dict[str, Any]:

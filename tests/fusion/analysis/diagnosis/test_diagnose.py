@@ -11,7 +11,8 @@ from fusion.analysis.diagnosis import diagnose as module
 from fusion.analysis.diagnosis.causes import undetermined_check
 from fusion.analysis.diagnosis.diagnose import (
     THRESHOLDS,
-    _directions_sentence,
+    _agreement,
+    _directions,
     _objections,
     _probabilities,
     diagnose,
@@ -146,7 +147,7 @@ BOTH = "1.00 µm in the positive direction, {:.2f} µm in the negative direction
 def test_directions_are_called_equal_only_within_their_uncertainty(readings, negative_um, sentence):
     row = np.resize([1.0, -1.0], readings)
     residual = SimpleNamespace(values=np.stack([row, negative_um * row]), scatter_um=(1.0, negative_um))
-    assert _directions_sentence(residual) == sentence.format(negative_um)
+    assert _directions(_agreement(residual), residual) == sentence.format(negative_um)
 
 
 def fitted(**changes):
