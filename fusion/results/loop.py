@@ -77,7 +77,8 @@ class ModelError(HeldOutError):
     expected_high_um: Number = None
     """Its upper end, um; null of the declared and final model of a record."""
     expected_p: Number = None
-    """Probability of an error as large or larger where the model is right, by simulation; null as the range."""
+    """Probability of an error as large or larger where the model is right, by simulation; of a forecast from the last value by
+    the distribution that its uncertainty states. Null as the range."""
 
     @property
     def exceeds(self) -> bool | None:

@@ -52,11 +52,7 @@ def expect_errors(model: ModelFit, errors_um: Array, *, seed: int = 1) -> schema
     Such tests are simulated with the drift and noise that the training part leaves possible, and predicted with coefficients of their own.
     """
     drawn = simulated_errors(model, np.random.default_rng(seed))[np.isfinite(errors_um)]
-    return expected_error(rmse(errors_um), np.sqrt(np.mean(drawn**2, axis=0)))
-
-
-def expected_error(achieved: float, each: Array) -> schema.ModelError:
-    """An error of a model beside those (draws,) that it makes of simulated hold-outs, um."""
+    achieved, each = rmse(errors_um), np.sqrt(np.mean(drawn**2, axis=0))
     low, high = np.percentile(each, _EXPECTED_PERCENT)
     return schema.ModelError(
         rmse_um=achieved,

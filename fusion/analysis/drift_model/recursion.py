@@ -21,7 +21,6 @@ from fusion.analysis.drift_model.predictions import (
     BASELINE_LAGS_MIN,
     PENALTIES,
     channel_rmse,
-    expected_error,
     last_values,
     rmse,
 )
@@ -62,8 +61,9 @@ _LEAST_UM2 = 1e-12
 _LEAST_SIZE, _PENALTIES = 1e-12, np.append(PENALTIES, np.inf)
 #: Equal parts of a single run, of which those of the later half are predicted for the choice of a forecast.
 _PARTS = 8
-#: Simulated hold-outs behind the uncertainty of a forecast.
-_DRAWS = 400
+#: Share of hold-outs whose mean square error lies below, and above, the range of a forecast: it is distributed as chi-squared with two
+#: degrees of freedom, as that of a random walk is within a few per cent.
+_OUTSIDE = 0.025
 #: Turns and change (in the logarithm of a variance) in which the sizes settle.
 _TURNS, _SETTLED = 60, 1e-3
 
@@ -264,6 +264,10 @@ def _most_probable(marginal: Marginal, ratio: float, scale: Array) -> tuple[floa
     return scaled.log_likelihood(variance), known
 
 
+#: Blocks that are predicted, behind those that they are predicted from.
+_Ahead = tuple[NDArray[np.bool_], NDArray[np.bool_]]
+
+
 @dataclass(frozen=True)
 class Following:
     """How one displacement follows columns from its last value on.
@@ -294,22 +298,15 @@ def follow(
         every, whole = np.ones(len(columns), bool), respond(record, values, events, used)
         missed_um = expected_um(whole, record, values, part_s(record))
         return [Following(every, 0.0, one.coefficients, um) for one, um in zip(whole, missed_um.tolist(), strict=True)]
-    choices = [
-        np.array([one.time_constant_s <= lag_s for one in columns], bool)
-        for lag_s in sorted({one.time_constant_s for one in columns})
-    ]
     found = []
     for k, course in enumerate(record.displacement.T):
         known = used & np.isfinite(course)
-        parts = _later_parts(record, known)
+        parts = _later_parts(known)
+        choices = _choices(columns)
         # The last penalty is that under which nothing is followed.
         kept, penalty, least = choices[0], _PENALTIES.size - 1, np.inf
         for some in choices if parts else ():
-            squares = np.zeros(_PENALTIES.size)
-            for before, part in parts:
-                fitted = _regress(record, course[:, None], values[:, some], events[..., k], before)[..., 0]
-                missed = _from_last_values(record, course[:, None] - values[:, some] @ fitted.T, before)
-                squares += np.mean(missed[part] ** 2, axis=0) / len(parts)
+            squares = _missed_um2(record, course, values[:, some], events[..., k], parts)
             if squares.min() < least:
                 kept, penalty, least = some, int(np.argmin(squares)), float(squares.min())
         coefficients = np.zeros(len(columns))
@@ -318,10 +315,24 @@ def follow(
     return found
 
 
-def _later_parts(
-    record: Record, used: NDArray[np.bool_], number: int = _PARTS
-) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Blocks of one run that are predicted and those before them: the later half of so many equal parts."""
+def _choices(columns: Sequence[Signal]) -> list[NDArray[np.bool_]]:
+    """Columns (p,) that a displacement may follow: those of time constants up to each of them."""
+    lags_s = np.array([one.time_constant_s for one in columns])
+    return [lags_s <= longest for longest in np.unique(lags_s)]
+
+
+def _missed_um2(record: Record, course: Array, values: Array, events: Array, parts: Sequence[_Ahead]) -> Array:
+    """Mean square (penalties,), um^2, of what parts are missed by from the last value before each."""
+    squares = np.zeros(_PENALTIES.size)
+    for before, part in parts:
+        fitted = _regress(record, course[:, None], values, events, before)[..., 0]
+        missed = _from_last_values(record, course[:, None] - values @ fitted.T, before)
+        squares += np.mean(missed[part] ** 2, axis=0) / len(parts)
+    return squares
+
+
+def _later_parts(used: NDArray[np.bool_], number: int = _PARTS) -> list[_Ahead]:
+    """The later half of so many equal parts of one run, each behind the blocks before it."""
     parts = [np.isin(np.arange(used.size), rows) for rows in np.array_split(np.flatnonzero(used), number) if rows.size]
     return [(np.logical_or.reduce(parts[:k]), parts[k]) for k in range(number // 2, len(parts))]
 
@@ -354,35 +365,36 @@ def errors_of(record: Record, values: Array, following: Sequence[Following], use
     return np.column_stack([_from_last_values(record, one[:, None], used) for one in missed.T])
 
 
-def _drawn_errors(
+def _ahead_um2(
     record: Record,
-    course: Array,
+    columns: Sequence[Signal],
     values: Array,
     events: Array,
     one: Following,
-    response: Response,
-    used: NDArray[np.bool_],
-    *,
-    seed: int = 1,
+    channel: int,
+    train: NDArray[np.bool_],
 ) -> Array:
-    """Errors (blocks, draws), um, of predicting simulated courses of one displacement of a single run from those before the hold-out.
+    """Variance (blocks,), um^2, of the forecast of one displacement of a single run.
 
-    They respond and wander as the training time leaves possible, and are predicted with coefficients of their own. What later parts of it,
-    as long as the hold-out, were missed by beyond that enlarges them.
+    What it missed of later training parts as long as the hold-out, half of it from the start and half as a random walk, and how far from
+    it all other choices lead, each with the likelihood of what it missed.
     """
-    # The same draws for all: the drifts of the channels of one machine are alike.
-    drawn = response.draw(record.seconds, values, np.random.default_rng(seed), draws=_DRAWS)
-
-    def missed(courses: Array, known: NDArray[np.bool_]) -> Array:
-        fitted = _regress(record, courses, values[:, one.kept], events, known)[one.penalty == _PENALTIES][0]
-        return _from_last_values(record, courses - values[:, one.kept] @ fitted, known)
-
-    ahead = _later_parts(record, used, int(np.clip(used.sum() // (~used).sum(), 2, _PARTS)))
-    measured, expected = (
-        np.mean([np.mean(missed(courses, before)[part] ** 2) for before, part in ahead])
-        for courses in (course[:, None], drawn)
-    )
-    return missed(drawn, used) * np.sqrt(max(1.0, measured / expected))
+    course = record.displacement[:, channel]
+    used = train & np.isfinite(course)
+    parts = _later_parts(used, int(np.clip(used.sum() // (~train).sum(), 2, _PARTS)))
+    squares, apart = [], []
+    for some in _choices(columns):
+        squares.append(_missed_um2(record, course, values[:, some], events, parts))
+        fitted = _regress(record, course[:, None], values[:, some], events, used)[..., 0]
+        other = values[:, some] @ fitted.T - (values @ one.coefficients)[:, None]
+        apart.append(_from_last_values(record, other, used))
+        if np.array_equal(some, one.kept):
+            own = float(squares[-1][one.penalty == _PENALTIES][0])
+    missed = np.maximum(np.array(squares), _LEAST_UM2)
+    weights = (missed.min() / missed) ** (len(parts) / 2.0)
+    lead = record.seconds - record.seconds[used][-1]
+    open_um2 = np.einsum("cp,cbp->b", weights, np.array(apart) ** 2) / weights.sum()
+    return np.asarray(own * (0.5 + lead / lead[-1]) + open_um2)
 
 
 @dataclass(frozen=True)
@@ -413,25 +425,23 @@ def forecast(record: Record, events: Array, train: NDArray[np.bool_]) -> Anchore
         return None
     columns = columns_of(record, record.sensors)
     values = evaluate_columns(record, columns)
-    following, responses = follow(record, columns, values, events, train), respond(record, values, events, train)
+    following = follow(record, columns, values, events, train)
     errors = np.where(train[:, None], np.nan, errors_of(record, values, following, train))
-    drawn = np.array(
-        [
-            _drawn_errors(record, course, values, events[..., k], one, response, train & np.isfinite(course))
-            for k, (course, one, response) in enumerate(zip(record.displacement.T, following, responses, strict=True))
-        ]
-    )[:, ~train].transpose(2, 1, 0)
-    known = np.where(np.isfinite(errors[~train]), drawn, np.nan)
-    u = np.full(errors.shape, np.nan)
-    u[~train] = np.sqrt(np.mean(drawn**2, axis=0))
-    each = np.sqrt(known_mean(known**2, axis=1))
-    return Anchored(
-        record.displacement - errors,
-        u,
-        expected_error(rmse(errors), known_mean(each, axis=1)),
-        channel_rmse(errors),
-        np.sqrt(np.mean(each**2, axis=0)),
+    variance = np.column_stack(
+        [_ahead_um2(record, columns, values, events[..., k], one, k, train) for k, one in enumerate(following)]
     )
+    expected = np.sqrt(known_mean(np.where(np.isfinite(errors), variance, np.nan), axis=0))
+    achieved, expected_um = rmse(errors), float(known_mean(expected))
+    low, high = expected_um * np.sqrt(-np.log1p([-_OUTSIDE, _OUTSIDE - 1.0]))
+    error = schema.ModelError(
+        rmse_um=achieved,
+        expected_um=expected_um,
+        expected_low_um=low,
+        expected_high_um=high,
+        expected_p=float(np.exp(-((achieved / max(expected_um, _LEAST_SIZE)) ** 2))),
+    )
+    u = np.sqrt(np.where(train[:, None], np.nan, variance))
+    return Anchored(record.displacement - errors, u, error, channel_rmse(errors), expected)
 
 
 def make_recursion(
