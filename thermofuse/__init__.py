@@ -10,83 +10,17 @@ The names that a user needs, in the order of the work, from the three packages t
 ``python -m thermofuse`` is the command. Further functions: :mod:`thermography`, :mod:`interferometry`, :mod:`fusion`.
 """
 
+# ruff: noqa: F403, F405 - each name is written once, in __all__; a type checker finds it in the stubs of the packages
+
 from __future__ import annotations
 
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fusion import (
-        AxisGeometry,
-        Candidate,
-        Effect,
-        FusionError,
-        LoopResult,
-        Readings,
-        Record,
-        Results,
-        align,
-        close_loop,
-        correlate,
-        cycle_bounds,
-        diagnose,
-        export_results,
-        fetch_sample,
-        load_campaign,
-        plot_correlation,
-        plot_loop,
-        read_drivers,
-        read_record,
-        read_results,
-        reduce_record,
-        run_campaign,
-        simulate_campaign,
-    )
-    from interferometry import (
-        InterferometryError,
-        Iso230Budget,
-        build_deviations,
-        compensate,
-        detect_anomalies,
-        estimate_drift,
-        evaluate_iso230,
-        evaluate_neighbours,
-        plan_cycles,
-        plot_deviations,
-        plot_differences,
-        plot_drift,
-        plot_position,
-        plot_profile,
-        plot_reference_chart,
-        plot_scatter,
-        read_deviations,
-        read_environment,
-    )
-    from thermography import (
-        CameraParameters,
-        PlanGrid,
-        Region,
-        ThermographyError,
-        calibrate,
-        count_temperatures,
-        detect_hotspots,
-        draw_thermogram,
-        evaluate_regions,
-        export_frames,
-        find_isotherm,
-        index_frames,
-        index_recordings,
-        inspect_file,
-        plot_field,
-        read_fiducials,
-        read_frame,
-        read_profile,
-        reduce_frames,
-        reduce_moving_frames,
-        register,
-        subtract_frames,
-        thermogram,
-    )
+    from fusion import *
+    from interferometry import *
+    from thermography import *
 
 __version__ = metadata.version("thermofuse")
 

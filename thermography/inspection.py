@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from thermofuse.resources import vocabulary
 from thermography.common import ThermographyError
 from thermography.evaluation import RegionTable, measures_temperature, tabulate_regions
 from thermography.io.flir import FlirFrameReference, index_frames
@@ -29,25 +30,7 @@ from thermography.radiometry.planck import (
 #: Bolometer cameras with these file formats appeared after this year; an earlier date means that the clock was never set.
 _OLDEST_YEAR = 2001
 #: Code of a warning -> what to do about it.
-_REMEDIES = {
-    "frame_left_out": "Copy the file from the camera again if the frame matters.",
-    "no_time": "They take no part in the course over time.",
-    "clock_not_set": "Set it, or give thermography.clock_offset in the campaign.",
-    "several_cameras": "Store the frames of each camera in a separate file.",
-    "several_lenses": "Use one lens: another one shows the scene elsewhere and at another scale.",
-    "parameters_vary": "Where the scene did not change, state one value for all pictures under [thermography].",
-    "emissivity": "Give emissivity.",
-    "distance_zero": "Give object_distance.",
-    "humidity": "Give relative_humidity as a fraction.",
-    "humidity_percent": "It was divided by 100.",
-    "not_calibrated": "Only the counts can be used.",
-    "checksum": "The file was changed after the camera wrote it; compare it with the original.",
-    "not_radiometric": "Use its counts for contrast only; FLIR's model with R in its name is calibrated.",
-    "overrange": "Select another range in the camera.",
-    "underrange": "Select another range in the camera.",
-    "no_content": "The shutter was closed, or the frame is damaged.",
-    "stored_transmission": "Give object_distance to calculate it instead.",
-}
+_REMEDIES = vocabulary("frames")["remedies"]
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,7 @@ from fusion.results.store import by_approach, group, has
 from interferometry.deviations import REGISTRY
 from interferometry.io.tables import DATED
 from interferometry.plots import time_span
+from thermofuse.resources import vocabulary
 
 if TYPE_CHECKING:
     from fusion.analysis.drift_model.verification import ChannelVerdict
@@ -843,13 +844,7 @@ def rate_text(rate: float) -> str:
 
 _PERIODS = ("first_hour", "whole", "last_hour", "change")
 _TITLES = ("first 60 min", "whole test", "last 60 min", "last − first")
-_KINDS = {
-    "environment": "Environmental temperature variation (ETVE)",
-    "spindle": "Distortion by the rotating spindle",
-    "linear axis": "Distortion by a moving linear axis",
-    "rotary axis": "Distortion by rotary motion",
-    "not stated": "Kind of test not stated",
-}
+_KINDS = vocabulary("names")["thermal_tests"]
 
 #: Curves of one chart of a test; the others are in the table.
 DRAWN = 8

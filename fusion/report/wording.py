@@ -43,6 +43,7 @@ from fusion.results.numbers import (
 from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
 from fusion.results.progress import counted
 from fusion.results.results import Results
+from thermofuse.resources import vocabulary
 
 # Tables as the report and the terminal show them: columns, rows, and which rows are marked.
 
@@ -90,35 +91,15 @@ def print_table(shown: Table, title: str) -> rich.table.Table:
     return printed
 
 
-_FIGURE_WORDS: dict[Figures, str] = {
-    "positions": "what the laser shows alone (deviations, drift, ISO 230-2 values, positions that stand out)",
-    "field": "what the camera shows alone (temperatures and their rise)",
-    "attribution": "which part of the field the drift follows",
-}
+_NAMES = vocabulary("names")
+_FIGURE_WORDS: dict[Figures, str] = _NAMES["figures"]
 
 
 #: Inputs of the radiometry in words, with their unit.
-INPUT_NAMES = {
-    "emissivity": "emissivity",
-    "reflected_temperature_K": "reflected apparent temperature / K",
-    "atmospheric_temperature_K": "temperature of the air / K",
-    "relative_humidity": "relative humidity",
-    "object_distance_m": "distance / m",
-    "window_transmission": "transmission of the window",
-    "window_temperature_K": "temperature of the window / K",
-    "camera_offset_K": "camera, constant part / K",
-    "camera_scale": "camera, share of the reading in °C",
-    "camera_drift_K": "camera, drift of its zero between cycles / K",
-    "reflected_change_K": "reflected apparent temperature, change between cycles / K",
-}
+INPUT_NAMES: dict[str, str] = _NAMES["radiometry"]
 
 #: Parts of the drift as the correlation names them, in plain words.
-CHANNELS = {
-    "common": "drift common to all positions",
-    "proportional": "drift that grows with position",
-    "reversal": "drift of the reversal",
-    "joint": "common and growing drift together",
-}
+CHANNELS: dict[str, str] = _NAMES["channels"]
 
 
 #: Units at the end of a name in the results, as they are printed.
@@ -128,37 +109,7 @@ _UNITS = {
 
 
 #: Numbers of a diagnosis in words, with their unit.
-EVIDENCE = {
-    "extra_um": "size beyond the other positions / µm",
-    "probability": "probability of the cause that is named",
-    "probability_structural": "probability of mechanical scatter",
-    "probability_link": "probability of a jump between two positions",
-    "jump_um": "jumps, standard deviation / µm",
-    "jump_u_um": "its standard uncertainty / µm",
-    "link_before_ratio": "differences to the position before, over the typical one",
-    "link_after_ratio": "differences to the position behind, over the typical one",
-    "probability_stick_slip": "probability of stick-slip",
-    "probability_slow": "probability of a slow motion",
-    "probability_step": "probability of a sudden step",
-    "probability_local_temperature": "probability of a local temperature",
-    "scatter_typical_um": "scatter typical of the other positions / µm",
-    "scatter_positive_um": "scatter, positive approach / µm",
-    "scatter_negative_um": "scatter, negative approach / µm",
-    "serial_p": "serial correlation, p",
-    "approach_gain_nats": "unequal approaches, gain in log-likelihood",
-    "step_p": "step, p",
-    "step_um": "step / µm",
-    "step_u_um": "step, standard uncertainty / µm",
-    "step_cycle": "step, cycle",
-    "step_held_out_nats": "step, gain in log-likelihood on the other approach",
-    "temperature_p": "local temperature, p",
-    "temperature_um_per_K": "local temperature, sensitivity / (µm/K)",
-    "temperature_u_um_per_K": "its standard uncertainty / (µm/K)",
-    "temperature_scale_u_um_per_K": "of which from the scale of the rise / (µm/K)",
-    "temperature_lag_s": "local temperature, lag / s",
-    "temperature_held_out_nats": "local temperature, gain in log-likelihood on the other approach",
-    "temperature_warm_up_share": "local temperature, share of its course that one warm-up explains",
-}
+EVIDENCE: dict[str, str] = _NAMES["evidence"]
 
 
 class EffectWords(NamedTuple):
@@ -198,15 +149,7 @@ def region_words(name: str) -> str:
 
 
 #: Plain predictions of the hold-out in words, by their key in ``loop.baselines``.
-BASELINES = {
-    "last_value": "last cycle simply repeated",
-    "mean": "mean of the cycles before",
-    "least_squares": "least squares on all that was logged",
-    "ridge": "ridge regression on the same",
-    "ridge_with_lags": "ridge regression with lagged copies",
-    "mean_run": "mean course of the other runs",
-    "run_differences": "that course, with what differs between runs",
-}
+BASELINES: dict[str, str] = _NAMES["baselines"]
 
 
 def conditional(sentence: str, inputs: InputsPart | None, *figures: Figures) -> str:
@@ -281,31 +224,13 @@ def in_words(value: Any) -> str:
 
 TEMPLATES = Path(__file__).parent / "templates"
 #: Axis values in the terms of ISO 230-2:2014, in the order of the report.
-ISO230_TERMS = {
-    "A": "Bidirectional positioning accuracy A",
-    "R": "Bidirectional positioning repeatability R",
-    "E": "Bidirectional systematic positioning error E",
-    "M": "Mean bidirectional positioning error M",
-    "B": "Reversal error B",
-}
+ISO230_TERMS: dict[str, str] = _NAMES["iso230"]
 #: Values of each direction, in the terms of the standard.
-ONE_WAY_TERMS = {
-    "A": "Unidirectional positioning accuracy A",
-    "R": "Unidirectional positioning repeatability R",
-    "E": "Unidirectional systematic positioning error E",
-}
+ONE_WAY_TERMS: dict[str, str] = _NAMES["iso230_one_way"]
 #: Signs of the directions of approach.
 ARROWS = {"positive": "↑", "negative": "↓"}
 #: Inputs of the uncertainty of a positioning test in words.
-CONTRIBUTORS = {
-    "device": "laser with its air compensation",
-    "alignment": "alignment (cosine error)",
-    "material_temperature": "temperature of the material",
-    "expansion_coefficient": "expansion coefficient",
-    "environmental_variation": "environmental variation error (EVE)",
-    "sampling": "scatter of the readings",
-    "extremes": "bias of the largest of scattered values",
-}
+CONTRIBUTORS: dict[str, str] = _NAMES["contributors"]
 
 
 def _compiled(pattern: str) -> jinja2.BytecodeCache | None:

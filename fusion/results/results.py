@@ -53,40 +53,9 @@ SCHEMA_VERSION = 4
 #: Parts that earlier versions wrote in pixels where a camera measured alone; every picture is evaluated instead.
 _OF_A_PICTURE = ("registration", "camera", "radiometry", "field", "hotspots")
 #: Keys of schema 2 and earlier that have another name now.
-RENAMED_KEYS = {
-    "as_well_ppm_per_K": "alternative_ppm_per_K",
-    "behind_by": "gain_deficit",
-    "blocked": "not_admitted",
-    "camera_gain_decided": "camera_reduction_significant",
-    "camera_gain_um": "camera_reduction_um",
-    "decided": "significant",
-    "equal_places_mm": "equivalent_places_mm",
-    "least_p": "p_resolution",
-    "looks_like": "confounded_with",
-    "loss_at_most_um": "loss_upper_limit_um",
-    "nearest": "closest_effect",
-    "nearest_p": "closest_effect_p",
-    "nearest_share": "closest_effect_share",
-    "nuisance": "residual_drift",
-    "one_way_um": "unidirectional_um",
-    "p_beside_leader": "p_given_leading_mode",
-    "premise": "assumption",
-    "sealed_question": "held_out_test",
-    "settled_rule": "window_rule",
-    "share_not_separable": "collinear_share",
-    "unnamed": "unconfirmed_effects",
-    "within_s": "block_length_s",
-    "would_tell": "recommended_test",
-}
+RENAMED_KEYS = vocabulary("renamed")["keys"]
 #: The same for the tests of the residual, the keys of ``p_values``.
-RENAMED_TESTS = {
-    "course in time": "autocorrelation",
-    "direction along the axis": "direction_along_axis",
-    "memory": "autocorrelation",
-    "one place": "single_target",
-    "rhythm": "periodicity",
-    "slow pattern": "slow_pattern",
-}
+RENAMED_TESTS = vocabulary("renamed")["tests"]
 _UNKNOWN_APPROACH = {f"{name}_um": {"value": None, "u": None} for name in "ARE"}
 #: What the first results by ISO 230-2 lack, which hold one window without its budget.
 _WITHOUT_BUDGET: dict[str, Any] = {
@@ -97,19 +66,7 @@ _WITHOUT_BUDGET: dict[str, Any] = {
     "contributions": [],
 }
 #: Earlier results name a condition by its words alone; keys that differ from those words.
-_CONDITIONS = {
-    "Air temperature before, after": "air_temperature",
-    "Compensation of the machine": "machine_compensation",
-    "Date of the test": "date",
-    "Dwell at a target": "dwell",
-    "Lead of the screw": "screw_lead",
-    "Material temperature before, after": "material_temperature",
-    "Places of the sensors": "sensor_places",
-    "Readings": "compensation",
-    "Serial number of the machine": "machine_serial_number",
-    "Travel of the axis": "axis_travel",
-    "Warm-up": "warm_up",
-}
+_CONDITIONS = vocabulary("renamed")["conditions"]
 #: Objects whose keys are names of a campaign: fiducials and channels.
 _NAMED_BY_THE_CAMPAIGN = ("leave_one_out_mm", "channels", "rms_by_channel_um")
 #: Faults of a file of which the first is named: each one that is written out takes a kilobyte.

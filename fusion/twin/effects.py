@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from fusion.twin.machine import Drive, Session, first_order, random_levels, refractivity, stream
+from thermofuse.resources import vocabulary
 
 Array = NDArray[np.float64]
 Shape = Literal["flat", "linear"]
@@ -25,39 +26,7 @@ Fault = Literal["stuck", "jump"]
 
 
 #: What the parameters of the effects mean; one name means the same in all of them.
-_MEANING = {
-    "um": "Size of the effect (of a load: at full load).",
-    "um_per_K": "Size of the effect per kelvin of the table's mean rise.",
-    "K": "Offset of the frames, or how much warmer than the surroundings the reflected body is.",
-    "mm": "Length of the dead path.",
-    "gain": "Share of the index change that is not compensated.",
-    "ppm_per_K": "Error of the expansion coefficient.",
-    "ppm": "Error of the wavelength when the laser is switched on.",
-    "arcsec": "Angle of the guide at full load.",
-    "abbe_mm": "Distance of the measured line from the guide.",
-    "time_constant_min": "Time constant of the first-order lag, or of the laser's warm-up.",
-    "follows": "Load that drives it.",
-    "shape": "Along the axis: equal at all positions (flat), or in proportion to the position (linear).",
-    "kind": "What happens at `at_cycle`: of the camera a step or a ramp, of a sensor that it sticks or jumps.",
-    "at_cycle": "Cycle in which it begins.",
-    "at_part": "Part of that cycle after which it begins, 0 to 1.",
-    "sensor": "Sensor of the environment unit that fails.",
-    "size": "Of a jump: its size in degC or hPa.",
-    "period_min": "Period of the sine.",
-    "start_period_min": "Period at the start of the test.",
-    "end_period_min": "Period at the end of the test.",
-    "lead_mm": "Period along the axis.",
-    "dead_path_mm": "Dead path of the laser.",
-    "x_mm": "Centre of the reflection on the plan, x.",
-    "y_mm": "Centre of the reflection on the plan, y.",
-    "spread_mm": "Standard deviation of the reflection on the plan.",
-    "mean_hold_min": "Mean time for which a state is held.",
-    "first_target": "First target that it affects.",
-    "last_target": "Last target that it affects.",
-    "centre_mm": "Position of the largest creep.",
-    "width_mm": "Standard deviation of the creep along the axis.",
-    "start_min": "Time scale of the creep.",
-}
+_MEANING = vocabulary("twin")["parameters"]
 
 
 @dataclass(frozen=True)
