@@ -72,6 +72,8 @@ app = typer.Typer(
 )
 console = Terminal()
 errors = Terminal(stderr=True, soft_wrap=True)
+#: Groups of entry points under which other packages offer effects and readers.
+_PLUGINS = {"thermofuse.effects", "thermofuse.frame_readers"}
 #: The longest time to wait for data, s.
 _YEAR_S = 365 * 86400.0
 #: Characters of a line of a wide table where the output is no terminal.
@@ -914,6 +916,9 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    # xarray loads dask with its first array, a fifth of the time of a short command; frames on a cluster need it, and plug-ins may.
+    if "--scheduler" not in " ".join(sys.argv) and not _PLUGINS & metadata.entry_points().groups:
+        sys.modules.setdefault("dask", None)  # type: ignore[arg-type]
     try:
         app(prog_name="thermofuse")
     except SystemExit as ended:

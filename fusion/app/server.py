@@ -265,7 +265,7 @@ _ADDRESS = "127.0.0.1"
 
 #: What the first screen reads a folder with: it is loaded while the browser starts.
 AHEAD = (
-    "fusion.app.setup.screen", "fusion.campaign.config", "interferometry.io.readings", "dask.array", "fusion.campaign.logs",
+    "fusion.app.setup.screen", "fusion.campaign.config", "interferometry.io.readings", "fusion.campaign.logs",
     "fusion.results.results",
 )  # fmt: skip
 

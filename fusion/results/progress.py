@@ -43,10 +43,8 @@ class Read(Protocol):
 
 def left_out_notices(dataset: Read, code: str) -> list[Notice]:
     """Return notices for each file that count its rejected lines and its cells without a reading, and list the first of them."""
-    from fusion.results.results import Notice  # loads numpy: progress is shown before
-
     return [
-        Notice.of(
+        _notice(
             "lines_left_out", code=code, left_out=counted(len(named), noun), path=path, named=listed(named), noun=noun
         )
         for name, noun in (("left_out", "line"), ("marks", "reading"))
@@ -56,12 +54,16 @@ def left_out_notices(dataset: Read, code: str) -> list[Notice]:
 
 def clock_notices(dataset: Read) -> list[Notice]:
     """Return one notice for each file whose clock goes back, with the first lines at which it does."""
-    from fusion.results.results import Notice  # as above
-
     return [
-        Notice.of("clock_goes_back", path=path, times=counted(len(named), "time"), named=listed(named))
+        _notice("clock_goes_back", path=path, times=counted(len(named), "time"), named=listed(named))
         for path, named in _lines_by_file(dataset, "clock")
     ]
+
+
+def _notice(words: str, **facts: Any) -> Notice:
+    from fusion.results.results import Notice  # loads the models of results, which few files need
+
+    return Notice.of(words, **facts)
 
 
 def _lines_by_file(dataset: Read, name: str) -> Iterator[tuple[str, list[str]]]:

@@ -34,7 +34,6 @@ from scipy import linalg, sparse, special
 from scipy.linalg import lapack
 
 from interferometry.common import Array
-from interferometry.drift import kalman
 from interferometry.drift.kalman import (
     MANY_COLUMNS,
     DriftModelError,
@@ -43,7 +42,14 @@ from interferometry.drift.kalman import (
     Order,
     Smoothed,
     drift_system,
+    innovation_variance,
+    predict_covariance,
+    predict_state,
     start_columns,
+    start_covariance,
+    sweep,
+    update_covariance,
+    update_state,
 )
 from thermofuse.compiled import njit
 
@@ -301,7 +307,7 @@ def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
 
 
 def _sweep(gram: Array) -> tuple[Array, float, int]:
-    """Sweep a scaled Gram matrix as `kalman.sweep` does; one of many columns by its Cholesky factor, which takes a tenth of the time."""
+    """Sweep a scaled Gram matrix as `sweep` does; one of many columns by its Cholesky factor, which takes a tenth of the time."""
     if gram.shape[0] >= MANY_COLUMNS:
         lower, failed = lapack.dpotrf(gram[1:, 1:], lower=1)
         pivots = np.diag(lower) ** 2
@@ -313,7 +319,7 @@ def _sweep(gram: Array) -> tuple[Array, float, int]:
             swept[0, 0], swept[0, 1:], swept[1:, 1:] = gram[0, 0] - along @ along, 0.0, inverse
             swept[1:, 0] = linalg.solve_triangular(lower, along, lower=True, trans="T")
             return swept, float(np.log(pivots).sum()), -1
-    return kalman.sweep(gram, _DEPENDENCE_TOLERANCE)
+    return sweep(gram, _DEPENDENCE_TOLERANCE)
 
 
 def _maximise(system: DriftSystem, response: Array, design: Design, start: Array | None) -> DriftFit:
@@ -600,7 +606,7 @@ def _filter_with_average(
 ) -> tuple[Array, Array, Array, Array]:
     """Filter with the average as part of the state."""
     n, components = loadings.shape
-    covariance = kalman.start_covariance(components * order, memory, components)
+    covariance = start_covariance(components * order, memory, components)
     size = covariance.shape[0]
     m = size - components
     state = np.zeros((size, columns.shape[1]))
@@ -609,15 +615,15 @@ def _filter_with_average(
     gains = np.zeros((n, size))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        kalman.predict_state(state, components, order, memory, step)
-        kalman.predict_covariance(covariance, order, ratios, memory, process_noise_scale[k], step)
+        predict_state(state, components, order, memory, step)
+        predict_covariance(covariance, order, ratios, memory, process_noise_scale[k], step)
         for c in range(components):
             for i in range(size):
                 predicted[k, c, i] = covariance[c * order, i]
         if observed[k]:
-            total = kalman.innovation_variance(covariance, order, loadings, k, memory, variance[k], cross_covariance)
-            kalman.update_covariance(covariance, cross_covariance, total)
-            kalman.update_state(state, order, loadings, k, memory, columns[k], cross_covariance, total, innovation)
+            total = innovation_variance(covariance, order, loadings, k, memory, variance[k], cross_covariance)
+            update_covariance(covariance, cross_covariance, total)
+            update_state(state, order, loadings, k, memory, columns[k], cross_covariance, total, innovation)
             for i in range(size):
                 gains[k, i] = cross_covariance[i] / total
         if weights[k] != 0.0:

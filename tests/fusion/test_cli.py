@@ -76,7 +76,7 @@ def test_a_run_shows_a_sign_of_life_before_it_loads_the_libraries(campaign_folde
         (["--help"], {"numpy", "xarray"}),
         (["inspect", "FRAME"], {"xarray", "pandas", "scipy", "numba"}),
         (["run", "CAMPAIGN", "--out", "RESULTS", "--resume"], {"xarray", "pandas", "scipy.stats", "numba", "bokeh"}),
-        (["check", "CAMPAIGN"], {"scipy.stats", "bokeh", "matplotlib"}),
+        (["check", "CAMPAIGN"], {"scipy.stats", "bokeh", "matplotlib", "numba"}),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
