@@ -63,6 +63,8 @@ LEAST_TARGETS = 3.5
 SHORTEST_TEST_CYCLES = 15
 _PERMUTATIONS = 199
 _SEED = 0
+#: Shares that a cycle keeps from the one before it in the courses that are looked for: a rhythm of few cycles, and a warm-up.
+_KEPT = (0.1, 0.85)
 
 
 def common_shape(residual: Array, known: Array) -> Array | None:
@@ -72,15 +74,17 @@ def common_shape(residual: Array, known: Array) -> Array | None:
         return None
     remainder = _without(residual, known)
     whitened = remainder[1:] - _memory(remainder) * remainder[:-1]
-    values, vectors = np.linalg.eigh(_succession(whitened))
-    shape = vectors[:, -1]
-    if 1.0 / float((shape**4).sum()) < LEAST_TARGETS:
-        return None
-    rng = np.random.default_rng(_SEED)
-    permuted = [np.linalg.eigvalsh(_succession(rng.permutation(whitened)))[-1] for _ in range(_PERMUTATIONS)]
-    if (1 + np.count_nonzero(np.array(permuted) >= values[-1])) / (_PERMUTATIONS + 1) > SHAPE_LEVEL:
-        return None
-    return np.asarray(shape / shape[np.argmax(np.abs(shape))])
+    for kept in _KEPT:
+        values, vectors = np.linalg.eigh(_succession(whitened, kept))
+        shape = vectors[:, -1]
+        rng = np.random.default_rng(_SEED)
+        permuted = [np.linalg.eigvalsh(_succession(rng.permutation(whitened), kept))[-1] for _ in range(_PERMUTATIONS)]
+        by_chance = (1 + np.count_nonzero(np.array(permuted) >= values[-1])) / (_PERMUTATIONS + 1)
+        if 1.0 / float((shape**4).sum()) >= LEAST_TARGETS and by_chance <= SHAPE_LEVEL / len(_KEPT):
+            # Cycles near each other show that there is a shape; all of them together tell it best.
+            shape = remainder.T @ (remainder @ shape)
+            return np.asarray(shape / shape[np.argmax(np.abs(shape))])
+    return None
 
 
 def _without(residual: Array, known: Array) -> Array:
@@ -101,10 +105,10 @@ def _memory(remainder: Array) -> float:
     return max(0.0, float(np.median(product[square > 0] / square[square > 0]))) if (square > 0).any() else 0.0
 
 
-def _succession(series: Array) -> Array:
-    """Symmetric covariance of successive rows."""
-    product = series[:-1].T @ series[1:]
-    return np.asarray(product + product.T)
+def _succession(series: Array, kept: float) -> Array:
+    """Symmetric covariance of rows with the others, whose share falls by a factor from one row to the next."""
+    apart = np.abs(np.subtract.outer(np.arange(len(series)), np.arange(len(series))))
+    return np.asarray(series.T @ (kept**apart - np.eye(len(series))) @ series)
 
 
 #: Deletion residual, in standard deviations, from which a reading is flagged as an outlier: among 10,000 normal
@@ -516,6 +520,10 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     excess = _excess_variance(scatter, freedom, joint) + _memory_variance(grid.per_reading(noise), joint)
     loadings = fit.system.loadings
     drift_variance = np.einsum("kc,kce,ke->k", loadings, covariance, loadings)
+    target = joint.cells[joint.cell, 1]
+    for square in drift[:, drift.shape[1] - joint.shapes.shape[1] :].T ** 2:
+        # A shape comes from the readings of its target, and is as uncertain as they are.
+        drift_variance += fit.sigma**2 * square / np.bincount(target, square)[target]
     result = xr.Dataset(
         {
             **_profile_variables(grid, joint, deviations, at_state, excess),

@@ -111,6 +111,8 @@ class Machine:
     unequal : how much the noise differs between sites, as the standard deviation of its logarithm
     growing : by what share of itself the noise grows from the first cycle to the last
     expansion_ppm_per_K, shift_um_per_K : what the axis does as its table warms
+    zone_height_mm : extent of the hot zone across the axis; infinite where the camera's cells need not resolve it
+    walk_um_per_root_h : further undeclared walk of all targets, two thirds of it as a stretch besides
     """
 
     cycles: int = 40
@@ -127,6 +129,8 @@ class Machine:
     shift_um_per_K: float = 2.5
     profile_um: float = 4.0
     reversal_um: float = 1.5
+    zone_height_mm: float = 60.0
+    walk_um_per_root_h: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -185,7 +189,7 @@ def measure(machine: Machine, rng: np.random.Generator) -> Campaign:
     load = LOADS[machine.load](rng, frame_s)
     zone, table = (first_order(frame_s, load, minutes) for minutes in (ZONE_MIN, TABLE_MIN))
     y, x = (np.arange(CELL_MM / 2.0, size, CELL_MM) for size in PLAN_MM[::-1])
-    near = np.exp(-(((x - 260.0) / 80.0) ** 2) - ((y[:, None] - 90.0) / 60.0) ** 2)
+    near = np.exp(-(((x - 260.0) / 80.0) ** 2) - ((y[:, None] - 90.0) / machine.zone_height_mm) ** 2)
     rise = TABLE_K * table[:, None, None] + ZONE_K * zone[:, None, None] * near
     temperature = 21.0 + rise + 0.02 * rng.standard_normal(rise.shape)
 
@@ -193,6 +197,8 @@ def measure(machine: Machine, rng: np.random.Generator) -> Campaign:
     at, where = seconds.ravel()[order], np.broadcast_to(share, seconds.shape).ravel()[order]
     undeclared = np.empty(seconds.size)
     undeclared[order] = DRIFTS[machine.drift](rng, at, where)
+    if rate := machine.walk_um_per_root_h:
+        undeclared[order] += walk(rng, at, rate) + where * walk(rng, at, 2.0 * rate / 3.0)
     undeclared = undeclared.reshape(seconds.shape)
     mean_K, integral = rise.mean(axis=(1, 2)), _integral(rise, x, y, position)
     shift = machine.shift_um_per_K * np.interp(seconds, frame_s, mean_K)

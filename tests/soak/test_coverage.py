@@ -12,9 +12,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fusion.analysis.alignment.align import AxisGeometry, align
+from fusion.analysis.alignment.readings import read_fused
+from fusion.analysis.drift_model.axis import declare, declared_coefficients
+from fusion.analysis.drift_model.model import fit_model
+from fusion.analysis.effects.library import library
 from interferometry.drift.estimate import estimate_drift
 from tests.soak.rates import campaigns, coverage_line, first_seed, within_and_ratio
-from tests.soak.simulator import DRIFTS, NOISES, Campaign, Machine, measure
+from tests.soak.simulator import DIRECTION, DRIFTS, LOADS, NOISES, ORIGIN_MM, Campaign, Machine, measure
 
 pytestmark = pytest.mark.slow
 RUNS = campaigns(60)
@@ -71,3 +76,30 @@ def test_noise(noise: str, quality: str, capsys: pytest.CaptureFixture[str]) -> 
         print(coverage_line(f"{noise}, {quality}", found))
     for name, (share, rms) in found.items():
         assert 0.92 <= share <= 0.98 and 0.7 <= rms <= 1.3, name
+
+
+@pytest.mark.parametrize("cycles", [20, 40, 80])
+def test_declared_coefficients(cycles: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """With U as a report prints it: no smaller than what parts of the test move."""
+    machine = replace(Machine(zone_height_mm=np.inf, walk_um_per_root_h=0.15), cycles=cycles)
+    loads, error, u = list(LOADS)[1:], [], []
+    for run in range(RUNS):
+        rng = np.random.default_rng([FIRST_SEED, 2000 + cycles, run])
+        made = measure(replace(machine, load=loads[run % 2]), rng)
+        axis = AxisGeometry(ORIGIN_MM, DIRECTION)
+        readings = read_fused(align(made.deviations, made.fields, axis, environment=made.environment))
+        model = fit_model(readings, declare(readings, ["axis_expansion", "table_offset"], library()))
+        found = declared_coefficients(model, 2)
+        truth = np.array([machine.expansion_ppm_per_K, machine.shift_um_per_K])
+        error.append(np.array([float(one.value or 0.0) for one in found]) - truth)
+        u.append([max(float(one.u or 0.0), float(one.jackknife_u or 0.0)) for one in found])
+    table = {
+        name: within_and_ratio(*one)
+        for name, one in zip(
+            ("expansion", "shift per kelvin"), zip(np.transpose(error), np.transpose(u), strict=True), strict=True
+        )
+    }
+    with capsys.disabled():
+        print(coverage_line(f"{cycles} cycles", table))
+    for name, (share, rms) in table.items():
+        assert share >= 0.9 and rms <= 1.3, name

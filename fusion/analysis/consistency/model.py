@@ -17,9 +17,9 @@ from fusion.analysis.alignment.readings import Series
 from fusion.analysis.consistency.checks import CLOCK, LOG, Found, check, judge
 from fusion.analysis.drift_model.model import ModelFit, Term, place_of, refit_fixed
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
-from fusion.analysis.levels import LINE_LEVEL
+from fusion.analysis.levels import LINE_LEVEL, REMAINDER_LEVEL
 from fusion.common import Array
-from fusion.results.loop import AxisLine
+from fusion.results.loop import AxisLine, AxisStep
 from interferometry.drift.kalman import DriftModelError
 
 # Other lines on the plan, another order of the targets or the other sign of the deviations, held against the declared
@@ -226,6 +226,10 @@ _LINES_SPAN = 0.1
 _BEYOND_SIGMAS = 3.0
 
 
+#: Effects whose shape along the axis an expansion along another line has too.
+_SHAPED_AS_EXPANSION = frozenset({"angular_growth", "pitch_error"})
+
+
 def _expansions(loop: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The declared expansion, where a coefficient is stated."""
     declared = loop.get("declared_coefficients", [])
@@ -233,19 +237,24 @@ def _expansions(loop: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def withhold_names(loop: Mapping[str, Any], effects: Mapping[str, Effect]) -> dict[str, Any]:
-    """The part ``loop`` of results.json, where the expansion contradicts the stated one without the names of effects that are told by
-    their course in time alone: one of them has taken, or left, a part of the expansion.
+    """The part ``loop`` of results.json without names that what stands beside them contradicts: of a course in time or a shape along the
+    axis where the expansion is not the stated one, of which it has taken, or left, a part; and of what is smaller than the structure left.
     """
-    stated = _expansions(loop)
-    if not stated or abs(_asked_for(stated[0])[2]) <= _LIMIT:
-        return dict(loop)
-    alone, alone_u, _ = _asked_for(stated[0])
-    why = f"beside it the axis would expand by {alone:.3g} ± {alone_u:.2g} ppm/K, which the stated coefficient contradicts"
-    steps = [
-        {**step, "withheld": step["withheld"] or why} if effects[step["effect"]].excited_by else step
-        for step in loop["steps"]
-    ]
-    return {**loop, "steps": steps}
+    stated, left = _expansions(loop), loop["unexplained"]
+    alone, alone_u, off = _asked_for(stated[0]) if stated else (0.0, 0.0, 0.0)
+    structure_um = left["rms_um"] if left["shape"] and left["p_value"] < REMAINDER_LEVEL else 0.0
+
+    def why(step: Mapping[str, Any]) -> str:
+        if abs(off) > _LIMIT and (effects[step["effect"]].excited_by or step["effect"] in _SHAPED_AS_EXPANSION):
+            return f"beside it the axis would expand by {alone:.3g} ± {alone_u:.2g} ppm/K, which the stated coefficient contradicts"
+        if structure_um > step["rms_um"] and not {"time_s", "period_min"} & set(step["parameters"]):
+            return f"its {step['rms_um']:.2g} µm are less than the {structure_um:.2g} µm of structure that are left beside it"
+        return ""
+
+    steps = [{**step, "withheld": step["withheld"] or why(step)} for step in loop["steps"]]
+    named = any(AxisStep.model_construct(**step).keeps_name and not step["withheld"] for step in steps)
+    nameless = steps and not named and loop["verdict"] in ("explained", "partial")
+    return {**loop, "steps": steps, "verdict": "unexplained" if nameless else loop["verdict"]}
 
 
 def _asked_for(entry: Mapping[str, Any]) -> tuple[float, float, float]:

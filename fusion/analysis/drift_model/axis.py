@@ -51,7 +51,6 @@ from fusion.analysis.drift_model.evaluation import (
 )
 from fusion.analysis.drift_model.gains import Products, by_width, orthogonalise, reductions, sum_products
 from fusion.analysis.drift_model.model import (
-    SHIFT_AND_STRETCH,
     ModelFit,
     Term,
     coefficient_spread,
@@ -974,6 +973,8 @@ def _ask_blocks(model: ModelFit, before_um: Array, after_um: Array) -> Answer:
     return replace(answer, where="in blocks that are left out")
 
 
+#: log10 factors on the variance of each walk that are averaged over: below, at and above what was estimated.
+_WALKS = (-0.75, 0.0, 0.75)
 #: Courses of a smooth drift, as powers of the time since the first reading: settling, trend, slow rhythm.
 _POWERS = (0.5, 1.0, 1.5)
 #: Its root mean square in units of a reading's noise: from what no test shows to what hides everything else.
@@ -985,7 +986,8 @@ def average_over_drifts(model: ModelFit) -> ModelFit:
 
     A warm-up that settles, or the rhythm of a day, looks like the effects themselves, and a random walk as large as what is left of it
     beside them knows nothing of it. Drifts are random walks of scaled variances with a smooth common drift and a smooth stretch, each of
-    normal coefficients, weighed by their marginal likelihood (Hoeting et al. 1999, Stat. Sci. 14, 382).
+    normal coefficients, weighed by their marginal likelihood (Hoeting et al. 1999, Stat. Sci. 14, 382), beforehand alike over the standard
+    deviations of the walks (Gelman 2006, Bayesian Anal. 1, 515).
     """
     fit = model.fit
     seconds, loadings = fit.system.seconds, fit.system.loadings
@@ -997,8 +999,9 @@ def average_over_drifts(model: ModelFit) -> ModelFit:
     own, other = np.arange(1, 1 + fit.design.shape[1]), np.r_[0, 1 + fit.design.shape[1] : columns.shape[1]]
     freedom = seconds.size + priors.response.size - own.size
     found: list[tuple[float, Array, Array]] = []
-    for system in scaled_systems(fit, SHIFT_AND_STRETCH):
+    for system in scaled_systems(fit, list(product(_WALKS, repeat=loadings.shape[1]))):
         gram, log_spread = system.normal_equations(columns)
+        log_spread -= float(np.log(system.ratios).sum())
         gram += known.T @ known
         normal = gram[np.ix_(own, own)]
         scale = np.sqrt(np.diag(normal))

@@ -372,13 +372,13 @@ PARTS = 6
 
 
 def coefficient_spread(model: ModelFit) -> Array:
-    """Standard deviation of every coefficient by the delete-a-group jackknife, over targets and over parts of the test; of one that
-    something is known of beforehand with the share of its lagged copies.
+    """Standard deviation of every coefficient by the delete-a-group jackknife, the larger of that over targets and that over parts of the
+    test, which both hold the noise; of one that something is known of beforehand with the share of its lagged copies.
     """
     readings = model.readings.subset(model.used)
     cycles = np.unique(readings.cycle)
     part = np.searchsorted(cycles, readings.cycle) * PARTS // cycles.size
-    return np.hypot(_jackknife(model, readings.target_index), _jackknife(model, part))
+    return np.maximum(_jackknife(model, readings.target_index), _jackknife(model, part))
 
 
 def _jackknife(model: ModelFit, group: NDArray[np.int64]) -> Array:

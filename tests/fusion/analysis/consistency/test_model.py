@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -280,8 +281,26 @@ def test_lines_that_fit_as_well_are_part_of_the_uncertainty_of_the_expansion() -
 
 
 @pytest.mark.parametrize(("value", "withheld"), [(11.5, False), (2.1, True)])
-def test_names_by_course_alone_are_withheld_where_the_expansion_contradicts(value: float, withheld: bool) -> None:
-    steps = [{"effect": name, "withheld": "", "coefficients": []} for name in ("unseen_heat_source", "dead_path")]
-    loop = withhold_names({**declared(value, 0.2), "steps": steps}, library())
-    assert bool(loop["steps"][0]["withheld"]) == withheld
-    assert not loop["steps"][1]["withheld"]
+def test_names_of_courses_and_shapes_are_withheld_where_the_expansion_contradicts(value: float, withheld: bool) -> None:
+    names = ("unseen_heat_source", "angular_growth", "dead_path")
+    loop = withhold_names(loop_with(*names, **declared(value, 0.2)), library())
+    assert [bool(step["withheld"]) for step in loop["steps"]] == [withheld, withheld, False]
+    assert loop["verdict"] == "partial"
+
+
+@pytest.mark.parametrize(
+    ("p_value", "rms_um", "verdict"), [(0.001, 0.4, "unexplained"), (0.001, 0.2, "partial"), (0.5, 0.4, "partial")]
+)
+def test_a_name_is_withheld_beside_structure_that_is_larger(p_value: float, rms_um: float, verdict: str) -> None:
+    left = {"shape": "one step; targets 3, 5", "rms_um": rms_um, "p_value": p_value}
+    loop = withhold_names(loop_with("dead_path", unexplained=left), library())
+    assert loop["verdict"] == verdict and bool(loop["steps"][0]["withheld"]) == (verdict == "unexplained")
+    loop["steps"][0].update(withheld="", parameters={"time_s": 60.0})
+    assert not withhold_names(loop, library())["steps"][0]["withheld"]
+
+
+def loop_with(*names: str, **parts: Any) -> dict[str, Any]:
+    step = {"withheld": "", "coefficients": [], "parameters": {}, "rms_um": 0.3, "borne_out": "yes"}
+    nothing = {"shape": "", "rms_um": 0.0, "p_value": 0.5}
+    steps = [{"effect": name, **step} for name in names]
+    return {"unexplained": nothing, "verdict": "partial", **parts, "steps": steps}
