@@ -6,7 +6,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 # The tests start the program a hundred times; without its bytecode each would compile all of it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test readme quick docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
+.PHONY: demo test tests readme quick docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
 
 $(VENV)/.run: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "thermofuse needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.12"; exit 1; }
@@ -32,9 +32,13 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# Types are checked beside the tests, as that takes one processor for a minute in a fresh clone.
+test: $(VENV)/.test
+	@$(MAKE) --jobs 2 lint tests
+
 # Three processes for two cores, because a test with a browser or a control waits half of its time; files in their order, so that those
 # tests are not left to the end. One thread each for linear algebra: more would only wait for one another.
-test: lint
+tests: $(VENV)/.test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
 
 # README's lines and Python and the cells of the tutorials, in a copy of the last commit with the environment that README's line makes.

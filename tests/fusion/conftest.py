@@ -54,6 +54,22 @@ machine_serial_number = "4711"
 operator = "J. Doe"
 """
 
+#: A record of a spindle with a heat source that no sensor sees.
+RECORD = """
+[campaign]
+title = "A spindle"
+seed = 44
+
+[record]
+hours = 18
+sensors = 5
+channels = 2
+
+[[effect]]
+name = "unseen_heat_source"
+amplitude_um = 6
+"""
+
 #: What decides the products of a run: the program, what it knows, and how tests make their campaigns.
 _SOURCES = ("thermofuse", "thermography", "interferometry", "fusion", "data", "tests/fusion")
 
@@ -115,6 +131,25 @@ def part_results(kept: Callable[[str, Callable[[Path], object]], Path], campaign
         return kept(name, fill) / "results"
 
     return run_once
+
+
+@pytest.fixture(scope="session")
+def spindle(kept: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """The folder of a record, `campaign`, and its `results`, by the command; tests do not change them."""
+    from typer.testing import CliRunner
+
+    from fusion.cli import app
+
+    def fill(folder: Path) -> None:
+        (folder / "recipe.toml").write_text(RECORD)
+        for command in (
+            ("simulate", folder / "recipe.toml", "--out", folder / "campaign"),
+            ("run", folder / "campaign" / "campaign.toml", "--out", folder / "results"),
+        ):
+            ended = CliRunner().invoke(app, [str(word) for word in command])
+            assert ended.exit_code == 0, ended.output
+
+    return kept("spindle", fill)
 
 
 @pytest.fixture(scope="session")

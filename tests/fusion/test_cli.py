@@ -237,48 +237,42 @@ def test_plan_proposes_a_schedule_and_refuses_half_a_source() -> None:
         assert (refused.exit_code, refused.stderr) == (2, f"thermofuse: {message}\n")
 
 
-def test_a_record_of_hours_is_explained(tmp_path: Path) -> None:
-    recipe = tmp_path / "recipe.toml"
-    recipe.write_text(
-        '[campaign]\ntitle = "A machining centre"\nseed = 44\n[record]\nhours = 24\n'
-        '[[effect]]\nname = "unseen_heat_source"\namplitude_um = 1.5\n'
-    )
-    assert invoke("simulate", recipe, "--out", tmp_path / "day").exit_code == 0
-    result = invoke("run", tmp_path / "day" / "campaign.toml", "--out", tmp_path / "out")
-    assert result.exit_code == 0, result.output
-    written = json.loads((tmp_path / "out" / "results.json").read_text())
+def test_a_record_is_explained_corrected_and_followed_by_the_next_test(spindle: Path, tmp_path: Path) -> None:
+    shutil.copytree(spindle, tmp_path, dirs_exist_ok=True)
+    day, out, recipe = tmp_path / "campaign" / "campaign.toml", tmp_path / "results", tmp_path / "recipe.toml"
+    written = json.loads((out / "results.json").read_text())
     jsonschema.validate(written, results_schema())
     assert [step["effect"] for step in written["loop"]["steps"]] == ["unseen_heat_source"]
-    assert written["loop"]["rmse_final_um"] < written["loop"]["rmse_declared_um"]
-    assert written["loop"]["verdict"] == "explained"
-    assert "Largest drift" in result.output
-    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert written["loop"]["rmse_final_um"] < 0.2 * written["loop"]["rmse_declared_um"]
+    assert written["loop"]["verdict"] == "partial"
+    page = (out / "report.html").read_text(encoding="utf-8")
     assert "lacks a heat source that no sensor sees" in page
-    with xr.open_dataset(tmp_path / "out" / "fusion.nc", engine="h5netcdf") as product:
+    with xr.open_dataset(out / "fusion.nc", engine="h5netcdf") as product:
         assert {"displacement", "predicted_final", "contribution", "sealed"} <= set(product.data_vars)
-    assert invoke("run", tmp_path / "day" / "campaign.toml", "--out", tmp_path / "out", "--resume").exit_code == 0
-    assert json.loads((tmp_path / "out" / "results.json").read_text())["loop"] == written["loop"]
+    again = invoke("run", day, "--out", out, "--resume")
+    assert again.exit_code == 0 and "Largest drift" in again.output
+    assert json.loads((out / "results.json").read_text())["loop"] == written["loop"]
     # The loop closes at the machine: a model for its control, the test after it, and the next test.
     model = tmp_path / "model" / "model.json"
-    exported = invoke("export", tmp_path / "out", "--format", "model-json", "--out", model.parent)
+    exported = invoke("export", out, "--format", "model-json", "--out", model.parent)
     assert exported.exit_code == 0, exported.output
     second = recipe.read_text().replace(
-        "hours = 24\n", f'hours = 24\nduty_seed = 1044\napplied = "{model}"\napplied_gain = -1.0\n'
+        "hours = 18\n", f'hours = 18\nduty_seed = 1044\napplied = "{model}"\napplied_gain = -1.0\n'
     )
     (tmp_path / "second.toml").write_text(second)
     assert invoke("simulate", tmp_path / "second.toml", "--out", tmp_path / "after").exit_code == 0
     after = tmp_path / "after" / "campaign.toml"
-    verified = invoke("verify", tmp_path / "out", after, "--applied", model, "--json")
+    verified = invoke("verify", out, after, "--applied", model, "--json")
     assert verified.exit_code == 1, verified.output
     faults = [one["fault"] for one in json.loads(verified.stdout)["channels"]]
     assert faults == ["wrong sign"] * len(faults) and faults
-    planned = invoke("plan", tmp_path / "out")
+    planned = invoke("plan", out)
     assert planned.exit_code == 0, planned.output
     head, *lines = planned.output.splitlines()
     assert head.startswith("standard uncertainty of a prediction under another duty, over ")
     assert lines[-1].split()[0].isdigit()
     program = tmp_path / "duty.ngc"
-    told = invoke("plan", tmp_path / "out", "--json", "--largest", "spindle speed=12000 1/min", "--nc", program)
+    told = invoke("plan", out, "--json", "--largest", "spindle speed=12000 1/min", "--nc", program)
     assert told.exit_code == 0, told.output
     proposed = json.loads(told.stdout)["proposed"]
     levels = proposed["levels"]["spindle speed"]
@@ -289,8 +283,8 @@ def test_a_record_of_hours_is_explained(tmp_path: Path) -> None:
     assert sum(dwells) == pytest.approx(3600.0 * proposed["hours"], abs=1.0) and words[-2:] == ["M5", "M30"]
     assert speeds == [one for one in levels if one]
     for bad in (("--largest", "speed=3000"), ("--nc", program, "--control", "unknown")):
-        assert invoke("plan", tmp_path / "out", *bad).exit_code == 2
-    refused = invoke("plan", tmp_path / "day")
+        assert invoke("plan", out, *bad).exit_code == 2
+    refused = invoke("plan", day.parent)
     assert refused.exit_code == 2 and "results.json" in refused.stderr
 
 

@@ -1,4 +1,7 @@
-"""Names that columns, fiducials, files, folders and tests may have: each arrives as it is wherever it is shown, and two stay two."""
+"""Names that columns, fiducials, files, folders and tests may have: each arrives as it is wherever it is shown, and two stay two.
+
+None reaches a page as markup or a script, a folder as a path, or the network.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,12 @@ import asyncio
 import csv
 import json
 import shutil
+import socket
 from collections.abc import Iterator, Sequence
 from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
+from typing import Any, NoReturn
 from unicodedata import normalize
 
 import docx
@@ -35,12 +40,22 @@ from tests.fusion.campaign_parts import change, simulated
 pytestmark = pytest.mark.chain
 
 NFD = normalize("NFD", "Größe")
-TITLE = " =1+1 <mark>A/B</mark> {{7*7}} [red]x[/red] 'q' \"q\" \\ 🌡 %41 @name $$x$$ :smile: "
+SCRIPT = "<script>window.harmed=1</script><img src=x onerror=harm()>"
+TITLE = " =1+1 ../../<mark>A/B</mark> {{7*7}} [red]x[/red] 'q' \"q\" \\ 🌡 %41 @name $$x$$ :smile: "
 CHANNELS = (
-    "Disp. X", "101", "items", "X", "X, predicted", "$\\frac$", "_y", "<mark>{{7*7}}</mark>", "a/b", "L" * 300, "mean",
+    "Disp. X", "101", "items", "X", "X, predicted", "_y $\\frac$ a/b", "<mark>{{7*7}}</mark>" + "L" * 300, "mean",
 )  # fmt: skip
-SENSORS = ("time", "1", "=1+1", "@x $y {0}", "[red]t[/red]", "Größe", NFD, "{0}", "%41 #", "index", "x.y.z")
-DRIVERS = ("a b", "a_b", "'q' \"q\"", "back\\slash", "🌡 :smile:", "values", "100 %", "D / 1")
+SENSORS = (
+    "time",
+    "1",
+    "=HYPERLINK('http://example.com')",
+    "@x $y {0} [red]t[/red] %41 #",
+    "Größe",
+    NFD,
+    "index",
+    SCRIPT,
+)
+DRIVERS = ("a b", "a_b", "'q' \"q\" back\\slash 🌡 :smile: 100 %", "values", "D / 1")
 #: What an axis is given: fiducials, and drivers beside those of the record.
 FIDUCIALS = ("a.b", "1", "<mark>F", "{{7*7}}", "=1+1", "@name", "#", "[red]", "Größe", NFD, "items", "L" * 300)
 
@@ -52,6 +67,9 @@ class Page(HTMLParser):
         super().__init__()
         self.told: list[str] = []
         self.elements: set[str] = set()
+        self.scripts = 0
+        self.handlers: list[str] = []
+        self.addresses: list[str] = []
         self.feed(page)
 
     @classmethod
@@ -60,6 +78,10 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.elements.add(tag)
+        held = dict(attrs)
+        self.scripts += tag == "script" and held.get("type") != "application/json"
+        self.handlers += [name for name in held if name.startswith("on")]
+        self.addresses += [str(held[name]) for name in ("src", "href", "action") if held.get(name)]
 
     def handle_data(self, data: str) -> None:
         if self.lasttag not in ("script", "style"):
@@ -74,6 +96,19 @@ def run(*arguments: str | Path) -> str:
     ended = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
     assert ended.exit_code == 0, ended.output
     return ended.output
+
+
+def no_network(*arguments: object, **options: object) -> NoReturn:
+    raise AssertionError("the program asked the network")
+
+
+def strict(path: Path) -> Any:
+    """JSON without the words that JSON does not have."""
+
+    def refuse(word: str) -> NoReturn:
+        raise AssertionError(f"{path.name} holds {word}")
+
+    return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
 
 
 def missing(names: Sequence[str], text: str) -> list[str]:
@@ -107,10 +142,10 @@ def words_of(path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The results of seven hours with a step that is found; nothing is written outside them."""
-    base = tmp_path_factory.mktemp("names")
+    """The results of seven hours with a step that is found, without a network; nothing is written outside them."""
+    base = tmp_path_factory.mktemp("names") / f"Prüfstand 测试 {'x' * 170}"
     folder = base / f"=1+1 #%41 {{0}} [1] <b>' {NFD}"
-    folder.mkdir()
+    folder.mkdir(parents=True)
     rng, seconds = np.random.default_rng(1), 60.0 * np.arange(400)
     courses = [1.0 - np.exp(-seconds / (1800.0 * (1 + k))) for k in range(len(SENSORS))]
     courses[0] += 0.4 * np.sin(seconds / 700.0)
@@ -134,7 +169,10 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     title = f"title = {json.dumps(TITLE, ensure_ascii=False)}"
     text = "\n".join(["[campaign]", title, "[record]", *stated])
     (folder / "campaign.toml").write_text(f"{text}\n", encoding="utf-8")
-    run("run", folder / "campaign.toml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(socket.socket, "connect", no_network)
+        patch.setattr(socket, "getaddrinfo", no_network)
+        run("run", folder / "campaign.toml")
     assert [path.name for path in base.iterdir()] == [folder.name]
     return folder / "results"
 
@@ -146,6 +184,41 @@ def test_a_report_of_a_record_holds_every_name_as_text(record: Path) -> None:
     page = Page.of(record / "report.html")
     assert not missing([*CHANNELS, *SENSORS, *DRIVERS, TITLE.strip()], page.text)
     assert "mark" not in page.elements
+    # BokehJS, the script that draws the charts, and that of the page.
+    assert page.scripts <= 3 and page.handlers == []
+    assert all(address.startswith(("#", "data:")) for address in page.addresses), page.addresses
+
+
+def test_products_are_strict_json_and_lie_where_they_belong(record: Path) -> None:
+    for name in ("results.json", "provenance.json", "manifest.json", ".stages/stamps.json"):
+        strict(record / name)
+    assert strict(record / "results.json")["campaign"] == TITLE
+    written = {"fusion.nc", "results.json", "provenance.json", "report.html", "manifest.json", ".stages"}
+    assert {path.name for path in record.iterdir()} == written
+    assert {path.name for path in record.parent.iterdir()} == {"campaign.toml", "rec [1] #.csv", "results"}
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium")
+def test_a_browser_runs_no_script_of_a_file_and_loads_nothing(record: Path, tmp_path: Path) -> None:
+    """Even what a template forgot to escape is not run: the policy of the page names its own scripts by their hashes."""
+    from playwright.sync_api import sync_playwright
+
+    page = (record / "report.html").read_text(encoding="utf-8")
+    forgotten = "<script>window.harmed=1</script><img src='http://localhost/x.png' onerror='window.harmed=1'></main>"
+    (tmp_path / "forgotten.html").write_text(page.replace("</main>", forgotten), encoding="utf-8")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        tab = browser.new_page()
+        told: list[str] = []
+        tab.on("console", lambda message: told.append(message.text) if message.type == "error" else None)
+        tab.on("pageerror", lambda error: told.append(str(error)))
+        tab.goto((tmp_path / "forgotten.html").as_uri())
+        tab.wait_for_selector("html[data-charts=drawn]")
+        assert tab.evaluate("window.harmed") is None
+        # The script, the picture and what is called when it fails; nothing of the page itself.
+        assert len(told) == 3 and all("Content Security Policy" in text for text in told), told
+        browser.close()
 
 
 def test_sheets_by_iso_230_3_hold_every_name_as_text(record: Path, tmp_path: Path) -> None:

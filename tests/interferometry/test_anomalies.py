@@ -121,7 +121,7 @@ def test_noise_with_memory_that_all_positions_have_makes_no_anomaly():
     """With cycles permuted as they are, a step would stand out in this campaign."""
     rng = np.random.default_rng(880_004)
     deviations, _ = simulate(rng, noise=0.4 * with_memory(rng.standard_normal((100, 2, 16)), 0.3))
-    assert not any(anomaly.stands_out for anomaly in detect_anomalies(deviations, estimate_drift(deviations)))
+    assert not any(anomaly.stands_out for anomaly in anomalies_of(deviations))
 
 
 def test_a_motion_stands_out_only_where_it_exceeds_those_of_the_other_positions(rng):

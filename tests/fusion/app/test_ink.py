@@ -63,25 +63,25 @@ def test_drop_zone_menus_and_number_fields_are_seen_on_a_dark_page(app, new_page
         assert np.median(arrow) < 60 and arrow.max() > 150, "a light arrow on a dark field"
 
 
+# Colours do not depend on the width, nor places on the theme: a desktop in the light, a phone in the dark.
 @pytest.mark.browser
-def test_every_chart_has_ink(app, flagged, new_page):
-    page = new_page(app[0], width=1400, color_scheme="light")
+@pytest.mark.parametrize(
+    ("scheme", "width"), [("light", 1400), pytest.param("dark", 390, marks=pytest.mark.slow)], ids=["desktop", "phone"]
+)
+def test_every_chart_has_ink(app, flagged, new_page, scheme, width):
+    page = new_page(app[0], width=width, color_scheme=scheme)
     page.get_by_text("12 fiducials agree").wait_for()
 
     def charts_have_ink(least: int) -> None:
-        # Colours do not depend on the width, nor places on the theme: a desktop in the light, a phone in the dark.
-        for scheme, width in (("light", 1400), ("dark", 390)):
-            page.emulate_media(color_scheme=scheme)
-            page.set_viewport_size({"width": width, "height": 900})
-            page.wait_for_timeout(900)
-            boxes = [box for box in page.locator(".bk-Figure").evaluate_all(PLACES) if box[2] > box[0]]
-            assert len(boxes) >= least, page.get_by_role("heading").all_inner_texts()
-            whole = Image.open(io.BytesIO(page.screenshot(full_page=True)))
-            for box in boxes:
-                paper, quarters = ink(whole.crop(box))
-                # Axis labels alone are ink in three quarters; lines and points take at least a thousandth of the area.
-                assert (quarters > 0.001).sum() >= 3, (scheme, width, box, quarters)
-                assert (paper < 100) == (scheme == "dark"), (scheme, width, box, paper)
+        page.wait_for_timeout(900)
+        boxes = [box for box in page.locator(".bk-Figure").evaluate_all(PLACES) if box[2] > box[0]]
+        assert len(boxes) >= least, page.get_by_role("heading").all_inner_texts()
+        whole = Image.open(io.BytesIO(page.screenshot(full_page=True)))
+        for box in boxes:
+            paper, quarters = ink(whole.crop(box))
+            # Axis labels alone are ink in three quarters; lines and points take at least a thousandth of the area.
+            assert (quarters > 0.001).sum() >= 3, (scheme, width, box, quarters)
+            assert (paper < 100) == (scheme == "dark"), (scheme, width, box, paper)
 
     def open_part(name: str) -> None:
         page.get_by_role("button", name=name, exact=True).first.press("Enter")

@@ -157,6 +157,7 @@ def published(path: Path, out: Path) -> Results:
     return results
 
 
+@pytest.mark.usefixtures("no_charts")
 @pytest.mark.parametrize(
     ("cycles", "targets", "directions"),
     [(1, 5, BOTH), (1, 2, ("negative",)), (2, 2, BOTH), (6, 5, ("positive",))],
@@ -173,6 +174,7 @@ def test_what_a_test_does_not_measure_is_judged_as_not_measured(tmp_path, cycles
         assert judged[f"A{arrow}"] == ("pass" if side in directions and several else "not measured")
 
 
+@pytest.mark.usefixtures("no_charts")
 @pytest.mark.parametrize("value", ["0", "10 * target + cycle"], ids=["zero", "moved alike"])
 def test_readings_without_scatter_end_with_the_values_of_the_standard_and_their_notice(tmp_path, value):
     path = write_laser(tmp_path / "campaign", 8, 5, BOTH)

@@ -15,17 +15,10 @@ pytestmark = pytest.mark.long
 
 
 def test_offset_of_37_s_is_found_and_its_uncertainty_covers():
-    errors, stated = [], []
-    for seed in range(5):
+    """The share of many that is covered: tests/soak/test_clock_offset.py."""
+    for seed in range(2):
         found = estimate_clock_offset(*campaign(np.random.default_rng(seed), cycles=3), feed_mm_per_min=300)
-        errors.append(found.offset_s - 37.0)
-        stated.append(found.offset_u_s)
-    errors, stated = np.array(errors), np.array(stated)
-    assert np.abs(errors).max() < 0.2
-    # 95 % expected within two standard uncertainties: 3 or fewer of 5 would happen once in 50 times.
-    assert (np.abs(errors) < 2 * stated).sum() >= 4
-    # and it is not covered by stating too much
-    assert stated.mean() < 3 * np.sqrt(np.mean(errors**2))
+        assert abs(found.offset_s - 37.0) < 3 * found.offset_u_s < 0.5
 
 
 @pytest.mark.parametrize("read_after_s", [0.0, 1.0, 2.0])
@@ -38,15 +31,15 @@ def test_instant_of_the_reading_within_the_stand_is_in_the_uncertainty(read_afte
     assert found.offset_u_s == pytest.approx(2.0 / np.sqrt(12), rel=0.05)
 
 
-def test_frames_at_few_phases_of_the_motion_leave_the_offset_open_and_say_so():
+# The last one meets the motion at one phase only: offset and feed are any of a line of pairs.
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1004])
+def test_frames_at_few_phases_of_the_motion_leave_the_offset_open_and_say_so(seed):
     """Every 10 s of a motion that repeats every 6 s: two frames of three show the table standing; feed and offset share the third."""
-    for seed in (0, 1004):
-        # The last one meets the motion at one phase only: offset and feed are any of a line of pairs.
-        arguments = campaign(np.random.default_rng(seed), cycles=3, interval_s=10.0)
-        found = estimate_clock_offset(*arguments)
-        assert abs(found.offset_s - 37.0) < 2 * found.offset_u_s
-        known = estimate_clock_offset(*arguments, feed_mm_per_min=300)
-        assert known.offset_s == pytest.approx(37.0, abs=0.1)
+    arguments = campaign(np.random.default_rng(seed), cycles=3, interval_s=10.0)
+    found = estimate_clock_offset(*arguments)
+    assert abs(found.offset_s - 37.0) < 2 * found.offset_u_s
+    known = estimate_clock_offset(*arguments, feed_mm_per_min=300)
+    assert known.offset_s == pytest.approx(37.0, abs=0.1)
 
 
 def test_feed_zero_and_rate_are_found_too(rng):

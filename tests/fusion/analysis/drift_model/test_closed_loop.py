@@ -67,7 +67,7 @@ def test_a_complete_model_stays_as_it_is(complete):
     [
         ("reversal_drift", {}),
         pytest.param("dead_path", {}, marks=pytest.mark.slow),
-        ("step_event", {"at_cycle": 25}),
+        pytest.param("step_event", {"at_cycle": 25}, marks=pytest.mark.slow),
         pytest.param("periodic_disturbance", {"period_min": 23.0}, marks=pytest.mark.slow),
         pytest.param("pitch_error", {}, marks=pytest.mark.slow),
     ],
@@ -92,6 +92,7 @@ def test_one_missing_effect_is_named_and_the_held_out_error_falls_to_the_noise(n
         assert "7" in str(step.parameters["possible_leads"])
 
 
+@pytest.mark.slow
 def test_an_unseen_source_that_follows_the_load_is_named():
     readings = readings_of(EffectRecipe("unseen_heat_source", amplitude_um=0.8), seed=11)
     found = close_loop(readings, DECLARED, effects=_few("unseen_heat_source", "thermal_lag"))
@@ -103,7 +104,7 @@ def test_an_unseen_source_that_follows_the_load_is_named():
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("direction_scale", "opposite in both directions"),
+        pytest.param("direction_scale", "opposite in both directions", marks=pytest.mark.slow),
         ("telegraph_switching", "targets 9-12, negative direction only"),
     ],
 )
@@ -119,6 +120,7 @@ def test_an_effect_outside_the_library_is_left_without_a_name_and_described(name
         assert left.verdict == "complete"
 
 
+@pytest.mark.slow
 def test_an_event_among_the_hold_out_cycles_is_found_in_the_second_look():
     step = EffectRecipe("step_event", amplitude_um=0.5, parameters={"at_cycle": 54})
     found = close_loop(readings_of(step), DECLARED, effects=_few("step_event", "reversal_drift", "dead_path"))
@@ -191,6 +193,7 @@ def test_too_few_cycles_are_refused():
         readings_of(cycles=3)
 
 
+@pytest.mark.slow
 def test_what_could_be_found_is_found_at_that_size():
     """An effect at twice the size that is found in 80 % of campaigns is found; the size of a reversal is set by the noise alone."""
     few = _few("reversal_drift", "pitch_error", "dead_path")
@@ -209,6 +212,7 @@ def _few(*names: str) -> dict[str, Effect]:
     return {name: library()[name] for name in (*DECLARED, *names)}
 
 
+@pytest.mark.slow
 def test_one_jump_of_the_camera_is_named_once():
     """Weighed by the coefficients of two rounds its column differs, and both columns become one when they settle."""
     readings = readings_of(effect_of("camera_offset", 0.4, 9007), seed=9007)
@@ -217,6 +221,7 @@ def test_one_jump_of_the_camera_is_named_once():
     assert len(events) == len(set(events)) >= 1
 
 
+@pytest.mark.slow
 def test_the_hold_out_set_judges_an_effect_beside_the_others():
     """Either of two missing effects is judged with the other in the model; both are right."""
     missing = ("air_index", "reversal_drift")
@@ -227,6 +232,7 @@ def test_the_hold_out_set_judges_an_effect_beside_the_others():
     assert found.steps[-1].rmse_after_um < found.steps[0].rmse_before_um
 
 
+@pytest.mark.slow
 def test_a_laser_that_warms_up_is_no_heat_source():
     """The memory of a body that starts warm decays alike, but that is no evidence for the load."""
     laser = effect_of("laser_warm_up", 0.4, 22004)
@@ -235,6 +241,7 @@ def test_a_laser_that_warms_up_is_no_heat_source():
     assert [step.effect for step in found.steps] == ["laser_warm_up"]
 
 
+@pytest.mark.slow
 def test_an_event_among_the_hold_out_cycles_does_not_hide_what_acts_beside_it():
     """The source is decided on the training cycles, which say nothing of the event: the error after holds the event in full."""
     missing = ("unseen_heat_source:flat", "step_event")
@@ -257,12 +264,13 @@ def test_a_declared_effect_has_the_prior_of_the_library():
         declare(campaign(), DECLARED, library())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "share_left"),
     [
         # A uniform jump between two frames is seen to a few mK; a patch's edge is blurred by the noise of single cells.
         (EffectRecipe("camera_offset", amplitude_K=0.5, parameters={"at_cycle": 20}), 0.05),
-        pytest.param(EffectRecipe("reflected_source", amplitude_K=25.0), 0.25, marks=pytest.mark.slow),
+        (EffectRecipe("reflected_source", amplitude_K=25.0), 0.25),
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
