@@ -26,6 +26,11 @@ def vocabulary(name: str) -> dict[str, Any]:
     return tomllib.loads(resource(f"vocabulary/{name}.toml").read_text(encoding="utf-8"))
 
 
+def sentence(words: str, table: str, code: str, **facts: object) -> str:
+    """Return a sentence of a file in `data/vocabulary/` with the numbers and names behind it."""
+    return str(vocabulary(words)[table][code].format(**facts))
+
+
 def variables(product: str) -> tuple[Contract, dict[str, dict[str, str]]]:
     """Return the contract of a product, of the variables that others rely on, and the attributes of all of them."""
     described = vocabulary("variables")[product]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
-from thermofuse.resources import vocabulary
+from thermofuse.resources import sentence, vocabulary
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,8 @@ class CauseRecord:
     check: str
 
 
+#: Return a sentence of the evidence for or against a cause.
+say = partial(sentence, "diagnosis", "evidence")
 CAUSES = {name: CauseRecord(**words) for name, words in vocabulary("diagnosis")["causes"].items()}
 
 
@@ -31,8 +34,3 @@ def undetermined_check(leading: str) -> str:
     if candidate is None:
         return generic
     return f"{generic} If the cause is {candidate.words}: {candidate.check[0].lower()}{candidate.check[1:]}"
-
-
-def say(evidence: str, **numbers: object) -> str:
-    """Return a sentence of the evidence for or against a cause."""
-    return str(vocabulary("diagnosis")["evidence"][evidence].format(**numbers))

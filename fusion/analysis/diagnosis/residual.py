@@ -23,12 +23,15 @@ from fusion.analysis.levels import REMAINDER_LEVEL
 from fusion.common import Array
 from fusion.results.loop import ResidualPart
 from interferometry.drift.gls import NO_MEMORY, Autoregression, DriftFit
+from thermofuse.resources import sentence
 from thermography.large_arrays import empty_arrays, one_by_one
 
 _PERMUTATIONS = 400
 _BLOCK = 5
 #: An unexplained drift counts as a remainder from this share of a reading's noise on.
 DRIFT_SHARE = 0.5
+#: Return a sentence on what is left of the readings.
+say = partial(sentence, "diagnosis", "remainder")
 
 
 @dataclass(frozen=True)
@@ -164,10 +167,10 @@ def with_drift(remainder: Remainder, fit: DriftFit) -> Remainder:
     if sizes[largest] <= DRIFT_SHARE * fit.sigma:
         return remainder
     course = "smooth" if fit.system.order == 2 else "irregular"
-    where = ("all positions alike", "growing along the axis")[largest] if sizes.size == 2 else f"channel {largest + 1}"
+    where = say("alike" if largest == 0 else "growing") if sizes.size == 2 else f"channel {largest + 1}"
     return replace(
         remainder,
-        shape=f"a slow, {course} drift without a name; {where}, both directions",
+        shape=say("slow", course=course, where=where),
         rms_um=float(sizes[largest]),
         series=drift[:, largest],
         free=lambda columns: columns - basis @ (basis.T @ columns),
@@ -244,7 +247,7 @@ def _time_words(cycles: NDArray[np.int64], series: Array, readings: Readings) ->
     centred = series - series.mean()
     total = float(centred @ centred)
     if total <= 0.0 or series.size < 8:
-        return "course in time not determined"
+        return say("no_course")
     steps = [
         (k * (series.size - k) / series.size) * (series[k:].mean() - series[:k].mean()) ** 2
         for k in range(2, series.size - 1)
@@ -256,16 +259,16 @@ def _time_words(cycles: NDArray[np.int64], series: Array, readings: Readings) ->
     ramp = np.corrcoef(np.arange(series.size), series)[0, 1] ** 2
     period = (readings.seconds[-1] - readings.seconds[0]) / 60.0 / line
     candidates = {
-        f"one step at cycle {cycles[at]}": max(steps) / total,
-        f"a rhythm of about {period:.0f} min": float(around) if line > 2 else 0.0,
-        "slow growth or decay": float(ramp),
+        say("step", cycle=cycles[at]): max(steps) / total,
+        say("rhythm", minutes=period): float(around) if line > 2 else 0.0,
+        say("growth"): float(ramp),
     }
     best = max(candidates, key=lambda words: candidates[words])
     if candidates[best] > 0.6:
         return best
     high = centred > 0
     changes = int((np.diff(high.astype(int)) != 0).sum())
-    return f"irregular, with {changes} changes of sign in {series.size} cycles"
+    return say("irregular", changes=changes, cycles=series.size)
 
 
 def _place_words(sites: list[tuple[int, str]], weights: Array) -> str:
@@ -284,15 +287,10 @@ def _place_words(sites: list[tuple[int, str]], weights: Array) -> str:
     odd = sum((a - b) ** 2 for a, b in pairs)
     where = f"target {targets[0]}" if len(targets) == 1 else f"targets {_runs(targets)}"
     if len(directions) == 1:
-        way = f"{next(iter(directions))} direction only"
-    elif odd > 4 * even:
-        way = "opposite in both directions"
-    else:
-        way = "both directions"
-    opposed = (
-        ", with opposite signs along the axis" if len(signs) == 2 and len(directions) == 2 and odd <= 4 * even else ""
-    )
-    return f"{where}, {way}{opposed}"
+        return say("one_way", where=where, direction=next(iter(directions)))
+    if odd > 4 * even:
+        return say("opposite", where=where)
+    return say("opposed" if len(signs) == 2 else "both_ways", where=where)
 
 
 def _runs(numbers: list[int]) -> str:

@@ -25,6 +25,7 @@ from fusion.analysis.drift_model.predictions import (
     rmse,
 )
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record
+from fusion.analysis.drift_model.search import say
 from fusion.common import Array
 from fusion.results import loop as schema
 from fusion.results.loop import RecordLoop
@@ -468,20 +469,16 @@ def make_recursion(
     curve: list[SensorCurvePoint] = []
     told = [*remarks]
     if constant := product.attrs.get("constant_drivers"):
-        told.append(
-            f"constant over the whole test: {constant}; how the machine responds to it is not known: correction and uncertainty hold at "
-            "that load alone, from a start as in the test, and nothing reads it"
-        )
+        told.append(say("handed_over", "constant", drivers=constant))
     if reduced:
         curve, chosen = sensor_curve(record, events_of(product, loop), train)
         sensors = chosen.sensors
-        told.append(
-            f"reduced to {len(sensors)} of {len(record.sensors)} sensors: {', '.join(sensors) or 'none'}; error on the "
-            f"hold-out set {chosen.held_out_rmse:.3g} um, with all {curve[0].held_out_rmse:.3g} um"
-        )
+        named = {"kept": len(sensors), "of": len(record.sensors), "named": ", ".join(sensors) or "none"}
+        errors = {"error_um": chosen.held_out_rmse, "with_all_um": curve[0].held_out_rmse}
+        told.append(say("handed_over", "reduced", **named, **errors))
     columns, events = columns_of(record, sensors), events_of(product, loop)
     unseen = [step.effect for step in loop.steps if step.effect not in FOLLOWED]
-    told += [f"not contained, because no reading shows it: {effect}" for effect in unseen]
+    told += [say("handed_over", "not_contained", effect=effect) for effect in unseen]
     values = evaluate_columns(record, columns)
 
     def missed(used: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
@@ -499,21 +496,15 @@ def make_recursion(
     skilled = [k for k in range(len(record.channels)) if held_out[k] < before[k]]
     if not skilled or not columns:
         raise RecursionError("no displacement of the hold-out set is predicted better than by its last value")
-    told += [
-        "each displacement responds to every sensor and driver at once and with time constants of up to "
-        f"{BASELINE_LAGS_MIN[-1]:g} min, whatever the report names: error on the hold-out set from the last values before it "
-        f"{float(known_mean(held_out)):.3g} um; the report's headline model, which is not started there, {loop.rmse_final_um:.3g} um",
-        f"uncertainties hold for about {part_s(record) / 3600.0:.2g} h after a zero: what no reading shows goes on, and needs a new zero",
-    ]
+    numbers = {"error_um": float(known_mean(held_out)), "longest_min": BASELINE_LAGS_MIN[-1]}
+    told.append(say("handed_over", "responds", headline_um=loop.rmse_final_um, **numbers))
+    told.append(say("handed_over", "holds", hours=part_s(record) / 3600.0))
     idle = [name for k, name in enumerate(record.channels) if k not in skilled]
-    told += [
-        f"no correction of {name}: its hold-out set is predicted no better than by its last value" for name in idle
-    ]
+    told += [say("handed_over", "no_correction", name=name) for name in idle]
     whole = np.column_stack([one.coefficients for one in followed])
     inputs = _inputs(record, columns)
     told += [
-        f"{one.name} was never negative in the test: hand over its magnitude, also for the other sense of rotation; a negative value "
-        "counts as a failed reading"
+        say("handed_over", "never_negative", name=one.name)
         for one in inputs
         if one.name in record.drivers and one.low == one.failed_below
     ]

@@ -26,7 +26,7 @@ from fusion.analysis.effects.library import LIBRARY
 from fusion.analysis.levels import RIVAL_LEVEL
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
-from thermofuse.resources import vocabulary
+from thermofuse.resources import sentence
 from thermography.large_arrays import IN_MEMORY_BYTES, copy_to_disk, one_by_one
 
 # Decisions of the search: which effect entered, was refused or was withdrawn, for which reason and on what evidence.
@@ -77,13 +77,8 @@ WITHDRAWN = FINAL | {Reason.TOO_MANY_EVENTS}
 #: Reasons for which a significant effect has no name: it shows that something is missing all the same.
 WITHHELD = (BLOCKING - {Reason.COLLINEAR, Reason.WITHIN_DIGITS}) | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED}
 
-#: Decisions, names withheld and answers in words, with fields for their evidence.
-_SENTENCES = vocabulary("decisions")
-
-
-def say(table: str, code: str, **evidence: float | str) -> str:
-    """A sentence with the numbers and names behind it."""
-    return str(_SENTENCES[table][code].format_map(evidence))
+#: Return a sentence of decisions, names withheld and answers, with the numbers and names behind it.
+say = partial(sentence, "decisions")
 
 
 @dataclass(frozen=True)

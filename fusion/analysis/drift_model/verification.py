@@ -24,6 +24,7 @@ from fusion.analysis.drift_model.recursion import (
     record_of_product,
     respond,
 )
+from fusion.analysis.drift_model.search import say
 from fusion.common import Array
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import FAILED, UNKNOWN, Recursion, RecursionError, run_recursion
@@ -136,10 +137,9 @@ def verify(
         fault, reason = "", ""
         if dead:
             names = ", ".join(f"{name} ({faulty_sensors[name]})" for name in dead)
-            fault, reason = "dead sensor", f"{names} does not measure in this test, and the model reads it"
+            fault, reason = "dead sensor", say("verified", "dead_sensor", names=names)
         elif failed:
-            fault = "outside its range"
-            reason = "a reading was so far outside that the control took its sensor for failed"
+            fault, reason = "outside its range", say("verified", "outside_its_range")
         elif not is_kept or abs(gain - 1.0) > max(_OTHER_GAIN, 3.0 * gain_u):
             fault, reason = second.explain(0.0 if is_kept else EXPLAINS)
             fault, reason = ("", "") if is_kept and fault == _UNKNOWN else (fault, reason)
@@ -255,11 +255,9 @@ class _Second:
             share = 1.0 - float(np.var(left - columns @ coefficients)) / max(float(np.var(self.course)), 1e-12)
             judged[name] = likelihood, share
         gain, gain_u = self.gain()
-        told = f"by its course the correction acted with a gain of {gain:.2f} ± {2.0 * gain_u:.2f} (k = 2)"
+        told = say("verified", "gain", gain=gain, expanded_u=2.0 * gain_u)
         named = name_faults(judged, well, least_share)
         if not named:
-            return _UNKNOWN, f"{told}; no fault of the compensation explains half of what is left"
-        words = f"{told}; {named[0]} explains {100 * judged[named[0]][1]:.0f} % of what is left"
-        if _STALE in named:
-            words += "; the control runs other coefficients than the stated ones, or the machine has changed since"
-        return " or ".join(named), words
+            return _UNKNOWN, told + say("verified", "unknown")
+        told += say("verified", "explained", fault=named[0], percent=100 * judged[named[0]][1])
+        return " or ".join(named), told + (say("verified", "stale") if _STALE in named else "")

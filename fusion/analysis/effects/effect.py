@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from fusion.analysis.alignment.readings import Readings, Series
 from fusion.common import Array
-from thermofuse.resources import vocabulary
+from thermofuse.resources import sentence, vocabulary
 
 Parameters = dict[str, float | str]
 
@@ -237,6 +238,10 @@ _SECOND_BODY = (0.25, 0.5, 1.0)
 _LEAST_PLACES = 3
 
 
+#: Return why an effect cannot be tried, or cannot be told from another.
+lacks = partial(sentence, "decisions", "lacks")
+
+
 def warm_up(readings: Readings, minutes: float) -> Array:
     """Approach to a steady state from the first reading on."""
     if minutes <= 0.0:
@@ -294,9 +299,9 @@ def thermal_states(readings: Readings, near: Candidate | None) -> Iterator[tuple
 def unmeasured_expansion(readings: Readings) -> str | None:
     """Say that the axis' own expansion was not measured, which looks like any smooth shape along it that follows a thermal state."""
     if "mean_rise" not in readings.series:
-        return "without a temperature along the axis its own expansion looks the same"
+        return lacks("expansion")
     if readings.places is not None and readings.places < _LEAST_PLACES:
-        return f"what {readings.places} contact sensors along the axis miss between them looks the same: place at least {_LEAST_PLACES}"
+        return lacks("places", places=readings.places, least=_LEAST_PLACES)
     return None
 
 

@@ -7,7 +7,15 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from fusion.analysis.alignment.readings import Readings
-from fusion.analysis.effects.effect import Candidate, Parameters, effect, unmeasured_expansion, values_near, warm_up
+from fusion.analysis.effects.effect import (
+    Candidate,
+    Parameters,
+    effect,
+    lacks,
+    unmeasured_expansion,
+    values_near,
+    warm_up,
+)
 from fusion.analysis.effects.events import detect_jumps, detect_sensor_jumps, detect_stuck_sensors
 from fusion.analysis.effects.thermal import needs_field
 from fusion.common import Array
@@ -20,13 +28,11 @@ from interferometry import compensation
 def _needs_jump(readings: Readings) -> str | None:
     if needs_field(readings) or detect_jumps(readings.series["mean_rise"]):
         return needs_field(readings)
-    return "no frame jumps against its neighbours"
+    return lacks("jump")
 
 
 def _needs_patch(readings: Readings) -> str | None:
-    if "patch_mean_rise" not in readings.series:
-        return "no patch of the field switches faster than heat can flow"
-    return None
+    return None if "patch_mean_rise" in readings.series else lacks("patch")
 
 
 @effect(needs=_needs_jump, repeats=True, errs_camera=True)
@@ -60,17 +66,15 @@ _WARM_UPS_MIN = (3.0, 6.0, 12.0, 24.0)
 
 def _needs_air(readings: Readings) -> str | None:
     missing = [name for name in _AIR if name not in readings.series]
-    return f"the environment log has no {', '.join(missing)}" if missing else None
+    return lacks("environment", missing=", ".join(missing)) if missing else None
 
 
 def _needs_material(readings: Readings) -> str | None:
-    return None if "material_temperature" in readings.series else "the environment log has no material_temperature"
+    return None if "material_temperature" in readings.series else lacks("environment", missing="material_temperature")
 
 
 def _needs_sensor_episode(readings: Readings) -> str | None:
-    if detect_sensor_jumps(readings) or detect_stuck_sensors(readings):
-        return None
-    return "no logged sensor jumps or sticks"
+    return None if detect_sensor_jumps(readings) or detect_stuck_sensors(readings) else lacks("episode")
 
 
 def _refractivity_change_ppm(readings: Readings) -> Array:

@@ -15,6 +15,7 @@ from fusion.analysis.effects.effect import (
     Separable,
     effect,
     first_order_responses,
+    lacks,
     thermal_states,
     um_per,
     unit_of_state,
@@ -81,7 +82,7 @@ def hidden_leads_mm(readings: Readings) -> str:
 def _hidden_leads(readings: Readings) -> str:
     """Leads of which evenly spaced targets see one phase only, in words."""
     hidden = hidden_leads_mm(readings)
-    return f"evenly spaced targets hide leads of {hidden}; space them unevenly to see all" if hidden else ""
+    return lacks("leads", hidden=hidden) if hidden else ""
 
 
 @effect(patterned=True, limitation=_hidden_leads)
@@ -129,12 +130,11 @@ _SECOND_BODY_TRIED = (0.25,)
 
 def needs_field(readings: Readings) -> str | None:
     """Say that a campaign without thermal frames cannot show an effect, or return None."""
-    return None if "mean_rise" in readings.series else "the campaign holds no temperature of the table"
+    return None if "mean_rise" in readings.series else lacks("field")
 
 
 def _needs_driver(readings: Readings) -> str | None:
-    needed = "nothing that drives a heat source was logged; log duty, speed or load as [drivers]"
-    return None if readings.drivers else needed
+    return None if readings.drivers else lacks("driver")
 
 
 @effect(needs=needs_field, follows_field=True, prior=Prior(11.7, EXPANSION_U_PPM_PER_K), declarable=True)
@@ -206,7 +206,7 @@ def _logged(readings: Readings) -> list[str]:
 
 
 @effect(
-    needs=lambda readings: None if _logged(readings) else "no room, coolant or humidity was logged",
+    needs=lambda readings: None if _logged(readings) else lacks("log"),
     masked_by=unmeasured_expansion,
     excited_by="driver",
 )

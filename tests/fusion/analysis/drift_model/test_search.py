@@ -21,7 +21,6 @@ from fusion.analysis.drift_model.gains import Gains
 from fusion.analysis.drift_model.model import Term
 from fusion.analysis.drift_model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
 from fusion.analysis.drift_model.search import (
-    _SENTENCES,
     Confirmation,
     Confirmed,
     Decision,
@@ -51,6 +50,7 @@ from fusion.analysis.effects.thermal import pitch_error
 from fusion.report.wording import parameters
 from fusion.results.loop import Nothing
 from tests.fusion.loop_bench import readings_of
+from thermofuse.resources import vocabulary
 
 CANDIDATE = Candidate(np.zeros((2, 1)), {}, ("um",))
 EVENT = Candidate(np.zeros((2, 1)), {}, ("um",), 1.0)
@@ -328,7 +328,7 @@ def test_every_reason_is_decided_with_the_fields_of_its_sentence():
     for path in Path(fusion.__file__).parent.rglob("*.py"):
         for reason, names in decided(ast.parse(path.read_text(encoding="utf-8"))):
             raised[reason] += 1
-            asked = {name for _, name, _, _ in Formatter().parse(_SENTENCES["decision"][reason]) if name}
+            asked = {name for _, name, _, _ in Formatter().parse(vocabulary("decisions")["decision"][reason]) if name}
             assert names >= asked, f"{path.name}: {reason}"
     assert all(raised.values()), raised
 
