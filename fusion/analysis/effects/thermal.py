@@ -29,6 +29,8 @@ from fusion.common import Array
 SHORTEST_LEAD_MM = 4.0
 #: Smallest amplitude of a wave at the targets that is more than rounding.
 _VISIBLE = 1e-6
+#: Share of a step by which a target may lie beside a grid that all targets have in common.
+_OFF_GRID = 0.005
 
 
 @effect(masked_by=unmeasured_expansion, patterned=True)
@@ -47,35 +49,35 @@ def reversal_drift(readings: Readings, _: Mapping[str, float], near: Candidate |
 
 def _spatial_frequencies(readings: Readings) -> Array:
     """Frequencies along the axis (1/mm) from two periods over the travel up to what the targets can show."""
-    positions = np.sort(readings.positions_mm)
-    travel = positions[-1] - positions[0]
-    highest = 0.5 * (positions.size - 1) if _evenly_spaced(readings) else travel / SHORTEST_LEAD_MM
-    return np.arange(2.0, highest + 1e-9, 0.5) / travel
+    travel, grid = float(np.ptp(readings.positions_mm)), _grid_mm(readings)
+    highest = travel * (0.5 / grid if grid else 1.0 / SHORTEST_LEAD_MM)
+    return np.asarray(np.arange(2.0, highest + 1e-9, 0.5) / travel)
 
 
-def _evenly_spaced(readings: Readings) -> bool:
-    """Whether targets are so even that a lead and its alias look alike: to a hundredth of the spacing."""
-    spacing = np.diff(np.sort(readings.positions_mm))
-    return bool(np.ptp(spacing) < 0.01 * spacing.mean())
+def _grid_mm(readings: Readings) -> float | None:
+    """Longest step of which all distances are multiples: a lead and its alias look alike there, also where targets lack."""
+    place = readings.positions_mm - readings.positions_mm.min()
+    shortest, travel = float(np.diff(np.sort(place)).min()), float(place.max())
+    parts = np.arange(1, 1 + max(1, int(2.0 * shortest / SHORTEST_LEAD_MM)))
+    steps = travel / np.round(travel * parts / shortest)
+    fits = [step for step in steps if np.abs(place / step - np.round(place / step)).max() < _OFF_GRID]
+    return max(fits, default=None)
 
 
 def _aliased_lead_mm(readings: Readings, frequency: float) -> str:
-    """Leads between 2 and 50 mm that evenly spaced targets show as the same frequency."""
-    spacing = np.diff(np.sort(readings.positions_mm))
-    if not _evenly_spaced(readings):
+    """Leads between 2 and 50 mm that targets on a grid show as the same frequency."""
+    grid = _grid_mm(readings)
+    if grid is None:
         return f"{1 / frequency:.3g} mm (targets unevenly spaced: no alias)"
-    sampling = 1.0 / spacing.mean()
-    orders = np.arange(0, int(0.5 / sampling) + 2)
-    leads = {1 / f for k in orders for f in (k * sampling + frequency, k * sampling - frequency) if 1 / 50 <= f <= 0.5}
+    orders = np.arange(0, int(0.5 * grid) + 2)
+    leads = {1 / f for k in orders for f in (k / grid + frequency, k / grid - frequency) if 1 / 50 <= f <= 0.5}
     return ", ".join(f"{lead:.3g}" for lead in sorted(leads, reverse=True)) + " mm"
 
 
 def hidden_leads_mm(readings: Readings) -> str:
-    """Leads between 2 and 50 mm of which evenly spaced targets see one phase only."""
-    if not _evenly_spaced(readings):
-        return ""
-    spacing = float(np.ptp(readings.positions_mm)) / (readings.positions_mm.size - 1)
-    leads = [spacing / k for k in range(1, int(spacing / 2.0) + 1) if 2.0 <= spacing / k <= 50.0]
+    """Leads between 2 and 50 mm of which targets on a grid see one phase only."""
+    grid = _grid_mm(readings) or 0.0
+    leads = [grid / k for k in range(1, int(grid / 2.0) + 1) if 2.0 <= grid / k <= 50.0]
     return ", ".join(f"{lead:.3g}" for lead in leads) + " mm" if leads else ""
 
 
@@ -91,10 +93,10 @@ def pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | No
     states = list(thermal_states(readings, near))
     if near is None:
         states = [pair for pair in states if pair[1]["time_constant_min"] in {0.0, 40.0, 60.0}]
-    if near is None and not _evenly_spaced(readings):
+    frequencies = _spatial_frequencies(readings)
+    if near is None and frequencies.size > readings.positions_mm.size:
         # Uneven targets leave a hundred and more waves to try; each then follows one course of every kind only.
         states = [p for p in states if p[1]["time_constant_min"] != 0.0 and p[1].get("start") != "at rest"]
-    frequencies = _spatial_frequencies(readings)
     if near is not None:
         close = 1.0 / float(near.parameters["period_mm"]) + np.linspace(-0.25, 0.25, 5) / np.ptp(readings.positions_mm)
         # A wave longer than half the travel is a bending, not a screw's.

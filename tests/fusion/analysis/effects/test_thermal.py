@@ -235,6 +235,13 @@ def test_spacings_within_a_hundredth_count_as_even(shift, even):
     assert ("no alias" in str(first.parameters["possible_leads"])) is not even
 
 
+def test_targets_lacking_on_a_grid_hide_its_leads_all_the_same():
+    """Distances of 30 and 40 mm are multiples of 10 mm, where a lead just below 10 mm looks like a wave as long as the axis."""
+    readings = warmed((0.0, 30.0, 70.0, 100.0, 130.0, 170.0, 200.0))
+    periods = [c.parameters["period_mm"] for c in pitch_error.candidates(readings, {}, None)]
+    assert (min(periods), hidden_leads_mm(readings)) == (pytest.approx(20.0), "10, 5, 3.33, 2.5, 2 mm")
+
+
 def test_leads_that_look_alike_on_even_targets_are_listed():
     """Targets every 50 mm see a wave of 150 mm where 1 / lead is a multiple of 1 / 50 plus or minus 1 / 150."""
     first = next(iter(pitch_error.candidates(warmed(), {}, None)))
