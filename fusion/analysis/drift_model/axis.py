@@ -116,6 +116,8 @@ _LARGEST_UM = 1e3
 _DRAWS = 20
 #: Share of its size by which a column that never moves differs from its mean: rounding.
 _ROUNDING = 1e-9
+#: Candidates whose columns are compared with the model together.
+_AT_ONCE = 64
 
 
 def detection_limits(
@@ -170,12 +172,13 @@ def _beside(model: ModelFit, candidates: Sequence[Candidate]) -> tuple[Array, Ar
     site = model.readings.subset(model.used).site
     q, _ = np.linalg.qr(model.fit.design)
     own, left, spread = np.empty((3, len(candidates)))
-    for k, candidate in enumerate(candidates):
-        column = candidate.columns[model.used][:, 0]
-        about = _about_sites(site, column)
-        own[k] = np.sqrt(np.mean(about**2)) if np.abs(about).max() > _ROUNDING * np.abs(column).max() else 0.0
-        left[k] = np.sqrt(np.mean((column - q @ (q.T @ column)) ** 2))
-        spread[k] = column.std()
+    for some in np.array_split(np.arange(len(candidates)), 1 + len(candidates) // _AT_ONCE):
+        columns = np.column_stack([candidates[k].columns[model.used][:, 0] for k in some])
+        for k, column in zip(some, columns.T, strict=True):
+            about = _about_sites(site, column)
+            own[k] = np.sqrt(np.mean(about**2)) if np.abs(about).max() > _ROUNDING * np.abs(column).max() else 0.0
+        left[some] = np.sqrt(np.mean((columns - q @ (q.T @ columns)) ** 2, axis=0))
+        spread[some] = columns.std(axis=0)
     return own, left, spread
 
 
