@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from bokeh.models import FixedTicker, LinearColorMapper
+from bokeh.models import FixedTicker, LinearColorMapper, Quad, Scatter
 from bokeh.plotting import figure
 
 from fusion.analysis.levels import ATTRIBUTION_LEVEL
@@ -20,6 +20,7 @@ from fusion.report.charts.style import (
     add_colour_bar,
     add_hold_out,
     add_series,
+    draw,
     fix_range,
     new_figure,
     of_direction,
@@ -44,9 +45,9 @@ _P_NAMES = {0.5: "≤ 0.01", 1.5: "≤ 0.05", 2.5: "≤ 0.1"}
 def _add_blank(drawn: figure, extent: Extent, name: str) -> None:
     """Hatch the plan, which shows wherever no cell is coloured."""
     left, right, bottom, top = extent
-    drawn.quad(
-        left=left, right=right, bottom=bottom, top=top, fill_color="#ffffff", line_color=None, hatch_pattern="right_diagonal_line",
-        hatch_color="#9aa7ad", hatch_scale=7, hatch_weight=0.6, level="image", legend_label=name,
+    draw(
+        drawn, Quad, left=left, right=right, bottom=bottom, top=top, fill_color="#ffffff", line_color=None,
+        hatch_pattern="right_diagonal_line", hatch_color="#9aa7ad", hatch_scale=7, hatch_weight=0.6, level="image", named=name,
     )  # fmt: skip
 
 
@@ -207,8 +208,9 @@ def plot_held_out_errors(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
         columns[f"{text}, mean of the cycle / µm"] = mean
         if values is raw:
             continue
-        dots = {"size": 2.5, "color": looks["colour"], "alpha": 0.45}
-        drawn.scatter(hours.values.ravel(), values.values.ravel(), legend_label=text, **dots)
+        colour = looks["colour"]
+        dots = {"line_color": colour, "fill_color": colour, "line_alpha": 0.45, "fill_alpha": 0.45}
+        draw(drawn, Scatter, x=hours.values.ravel(), y=values.values.ravel(), named=text, size=2.5, **dots)
         parts.append(f"{text} {number(float(np.sqrt(np.nanmean(values.values**2))))} µm rms")
     seen = (
         f"Errors of predicting the {int(held.sum())} cycles that were held out: {'; '.join(parts)}; the drift as measured moves over "

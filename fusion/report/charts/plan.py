@@ -7,7 +7,19 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import xarray as xr
-from bokeh.models import Arrow, ColorMapper, ColumnDataSource, GlyphRenderer, HoverTool, LinearColorMapper, NormalHead
+from bokeh.models import (
+    Arrow,
+    ColorMapper,
+    ColumnDataSource,
+    GlyphRenderer,
+    HoverTool,
+    Image,
+    Line,
+    LinearColorMapper,
+    NormalHead,
+    Scatter,
+    Text,
+)
 from bokeh.plotting import figure
 
 from fusion.report.charts.embedded import MapControls
@@ -22,6 +34,7 @@ from fusion.report.charts.style import (
     add_hover,
     add_ordered_lines,
     add_series,
+    draw,
     new_figure,
     palette,
     span_words,
@@ -78,17 +91,17 @@ def add_cells(
     """Draw values on the plan; NaN show what is below."""
     left, right, bottom, top = extent
     source = {name: [each.astype(np.float32)] for name, each in {"image": values, **layers}.items()}
-    place = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom}
-    cells = drawn.image("image", **place, color_mapper=mapper, source=source, level="image")
+    place: dict[str, Any] = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom}
+    cells = draw(drawn, Image, image="image", **place, color_mapper=mapper, source=source, level="image")
     add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), *tips], [cells])
     return cells
 
 
 def add_names(drawn: figure, x: Any, y: Any, names: Any, **options: Any) -> None:
     """Write names on a map, light on dark, which reads on every colour."""
-    drawn.text(
-        x, y, names, text_color="#ffffff", text_font_size="12px", background_fill_color=INK, background_fill_alpha=0.75, padding=2,
-        **options,
+    draw(
+        drawn, Text, x=x, y=y, text=names, text_color="#ffffff", text_font_size="12px", background_fill_color=INK,
+        background_fill_alpha=0.75, padding=2, **options,
     )  # fmt: skip
 
 
@@ -122,7 +135,7 @@ def draw_picture(
     drawn.grid.grid_line_color = None
     rounded = np.round(values * _STEP_PER_K) / _STEP_PER_K
     place = {"x": -0.5, "y": -0.5, "dw": columns, "dh": rows}
-    picture = drawn.image([rounded.astype(np.float32)], **place, color_mapper=mapper, level="image")
+    picture = draw(drawn, Image, image=[rounded.astype(np.float32)], **place, color_mapper=mapper, level="image")
     name, _, unit = label.partition(" / ")
     add_hover(drawn, [("column", "$x{0}"), ("row", "$y{0}"), (name, f"@image{{0.00}} {unit}")], [picture])
     add_colour_bar(drawn, mapper, label, place="right")
@@ -141,8 +154,14 @@ def plot_registration(
     column, row = fields["fiducial_column"].values, fields["fiducial_row"].values
     residual = fields["fiducial_residual"].values
     source = {"column": column, "row": row, "name": names, "residual": residual}
-    looks = {"marker": "circle", "size": 13, "fill_alpha": 0.0, "line_color": "#7fe3ff", "line_width": 2}
-    rings = drawn.scatter("column", "row", source=source, **looks)
+    looks: dict[str, Any] = {
+        "marker": "circle",
+        "size": 13,
+        "fill_alpha": 0.0,
+        "line_color": "#7fe3ff",
+        "line_width": 2,
+    }
+    rings = draw(drawn, Scatter, x="column", y="row", source=source, **looks)
     add_names(drawn, "column", "row", "name", source=source, x_offset=9, y_offset=-4)
     if "target_x" in fields:
         draw_both(drawn, *_to_frame(fields, fields["target_x"].values, fields["target_y"].values))
@@ -190,7 +209,7 @@ def _rim(area: AreaPart) -> tuple[np.ndarray, np.ndarray]:
 def draw_both(drawn: figure, x: np.ndarray, y: np.ndarray) -> None:
     """Draw a line dark under light, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 1.6)):
-        drawn.line(x, y, line_color=colour, line_width=width)
+        draw(drawn, Line, x=x, y=y, line_color=colour, line_width=width)
 
 
 def _on_plan(fields: xr.Dataset, shape: tuple[int, ...]) -> np.ndarray:
@@ -258,9 +277,10 @@ def plot_contact_sheet(fields: xr.Dataset) -> Chart:
     mapper = LinearColorMapper(palette(SEQUENTIAL), low=scale["low"], high=scale["high"], nan_color="#e1e5e7")
     names = [f"cycle {cycle}" for cycle in cycles]
     source = {"image": list(rise.values.astype(np.float32)), "x": x, "y": y, "cycle": names}
-    maps = drawn.image("image", x="x", y="y", dw=width, dh=height, color_mapper=mapper, source=source, level="image")
+    place: dict[str, Any] = {"x": "x", "y": "y", "dw": width, "dh": height}
+    maps = draw(drawn, Image, image="image", **place, color_mapper=mapper, source=source, level="image")
     add_hover(drawn, [("", "@cycle"), LAYERS[0].tip], [maps])
-    drawn.text(x, y - 0.01 * width, names, text_font_size="11px", text_color=INK)
+    draw(drawn, Text, x=x, y=y - 0.01 * width, text=names, text_font_size="11px", text_color=INK)
     add_colour_bar(drawn, mapper, "rise / K")
     seen = f"Rise of the table in {len(cycles)} of {count} cycles on one scale: {span_words(rise.values, 'K')}."
     cells = rise.stack(cell=("cycle", "y", "x"))
@@ -437,9 +457,9 @@ def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[st
         palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=BEYOND, high_color=BEYOND,
         name="scale",
     )  # fmt: skip
-    cells = drawn.image(
-        [values.astype(np.float32)], x=left, y=bottom, dw=right - left, dh=top - bottom, color_mapper=mapper, level="image", name="cells"
-    )  # fmt: skip
+    place: dict[str, Any] = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom}
+    cells = draw(drawn, Image, image=[values.astype(np.float32)], **place, color_mapper=mapper, level="image")
+    cells.name = "cells"
     add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), layer.tip], [cells])
     drawn.select_one(HoverTool).name = "reading"
     add_colour_bar(drawn, mapper, f"{layer.words} / {layer.unit}")
@@ -507,8 +527,8 @@ def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None)
         order = np.argsort(position.sel(target=targets).values, kind="stable")
     x, y = fields["target_x"].values[order], fields["target_y"].values[order]
     for colour, width in ((INK, 4), ("#ffffff", 1.6)):  # dark under light reads on every colour
-        drawn.line(x, y, line_color=colour, line_width=width)
-        drawn.scatter(x, y, marker="circle", size=width + 3, color=colour)
+        draw(drawn, Line, x=x, y=y, line_color=colour, line_width=width)
+        draw(drawn, Scatter, x=x, y=y, marker="circle", size=width + 3, line_color=colour, fill_color=colour)
     if x.size > 1:
         head = NormalHead(size=11, fill_color="#ffffff", line_color=INK)
         along = np.array([x[-1] - x[-2], y[-1] - y[-2]])
@@ -561,7 +581,8 @@ def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
 def add_marks(drawn: figure, x: Any, y: Any, marker: str, size: int, **options: Any) -> None:
     """Draw hollow marks, light on dark, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 2)):
-        drawn.scatter(x, y, marker=marker, size=size, fill_color=None, line_color=colour, line_width=width, **options)
+        looks = {"fill_color": None, "line_color": colour, "line_width": width, **options}
+        draw(drawn, Scatter, x=x, y=y, marker=marker, size=size, **looks)
 
 
 def _seen(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from bokeh.layouts import column
-from bokeh.models import Plot
+from bokeh.models import MultiLine, Plot
 from bokeh.plotting import figure
 
 from fusion.common import own_name
@@ -22,6 +23,7 @@ from fusion.report.charts.style import (
     add_hold_out,
     add_hover,
     add_series,
+    draw,
     fix_range,
     new_figure,
     of_rank,
@@ -92,10 +94,10 @@ def plot_temperatures(record: xr.Dataset) -> Chart:
     drawn = new_figure(x=_TIME, y="rise / K", height=340, zero=True)
     others = order[_NAMED:]
     if others.size:
-        lines = drawn.multi_line(
-            "xs", "ys", line_color=_PALE, line_width=1.1, legend_label="other sensors", hover_line_color=INK,
-            source={"xs": [hours] * others.size, "ys": list(rise.T[others]), "name": [names[k] for k in others]},
-        )  # fmt: skip
+        source = {"xs": [hours] * others.size, "ys": list(rise.T[others]), "name": [names[k] for k in others]}
+        looks: dict[str, Any] = {"xs": "xs", "ys": "ys", "line_width": 1.1}
+        hovered = MultiLine(**looks, line_color=INK)
+        lines = draw(drawn, MultiLine, source=source, named="other sensors", hovered=hovered, **looks, line_color=_PALE)
         add_hover(drawn, [("sensor", "@name"), ("time", "$x{0.00} h"), ("rise", "$y{0.00} K")], [lines])
     for rank, k in enumerate(order[:_NAMED]):
         add_series(drawn, hours, rise[:, k], name=names[k], width=2.0, **of_rank(rank))

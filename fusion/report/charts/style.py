@@ -25,12 +25,14 @@ from bokeh.models import (
     Glyph,
     GlyphRenderer,
     HoverTool,
+    HSpan,
     Label,
     LayoutDOM,
     Legend,
     LegendItem,
     Line,
     LinearColorMapper,
+    MultiLine,
     PanTool,
     PlainText,
     Plot,
@@ -129,7 +131,7 @@ def new_figure(
         "above",
     )  # fmt: skip
     if zero:
-        drawn.hspan(0.0, line_color=MUTED, line_width=1, level="underlay")
+        draw(drawn, HSpan, y=0.0, line_color=MUTED, line_width=1, level="underlay")
     return drawn
 
 
@@ -147,15 +149,30 @@ def literal(name: str) -> str:
     return html.escape(name).replace("@", "&#64;").replace("$", "&#36;")
 
 
-def add_mark(drawn: figure, source: ColumnDataSource, glyph: Glyph, name: str = "", **options: Any) -> GlyphRenderer:
-    """Draw a mark and name it in the legend. Bokeh's own methods make each one three times, for what is selected and what is muted."""
-    mark = drawn.add_glyph(source, glyph, nonselection_glyph=None, muted_glyph=None, **options)
-    if name:
-        named = next((item for item in drawn.legend[0].items if item.label == value(name)), None)
-        if named is None:
-            drawn.legend[0].items.append(LegendItem(label=value(name), renderers=[mark]))
+def draw(
+    drawn: figure,
+    kind: type[Glyph],
+    *,
+    source: ColumnDataSource | Mapping[str, Any] | None = None,
+    named: str = "",
+    level: str = "glyph",
+    hovered: Glyph | None = None,
+    **looks: Any,
+) -> GlyphRenderer:
+    """Draw marks of one kind, arrays among their looks being columns, and name them in the legend. Bokeh's own methods make each mark
+    three times, for what is selected and what is muted.
+    """
+    columns = {key: given for key, given in looks.items() if isinstance(given, list | np.ndarray)}
+    held = source if isinstance(source, ColumnDataSource) else ColumnDataSource({**(source or {}), **columns})
+    glyph = kind(**looks | {key: key for key in columns})
+    looks_else: dict[str, Any] = {"nonselection_glyph": None, "muted_glyph": None, "hover_glyph": hovered}
+    mark = drawn.add_glyph(held, glyph, level=level, **looks_else)
+    if named:
+        item = next((item for item in drawn.legend[0].items if item.label == value(named)), None)
+        if item is None:
+            drawn.legend[0].items.append(LegendItem(label=value(named), renderers=[mark]))
         else:
-            named.renderers.append(mark)
+            item.renderers.append(mark)
     return mark
 
 
@@ -176,19 +193,17 @@ def add_series(
 ) -> None:
     """Draw a named series with its values under the pointer; `half` the length (n,) of its error bars to either side, or (2, n) of each."""
     source = ColumnDataSource({"x": np.asarray(x), "y": np.asarray(y)})
-    named, parts = name if legend else "", []
+    common: dict[str, Any] = {"source": source, "named": name if legend else "", "line_color": colour}
+    parts = []
     if half is not None:
         below, above = np.broadcast_to(half, (2, len(y)))
-        ends = {"half": above, "low": np.asarray(y) - below, "high": np.asarray(y) + above}
-        source.data = {**source.data, **ends}
-        bars = Segment(x0="x", y0="low", x1="x", y1="high", line_color=colour, line_width=1.3)
-        add_mark(drawn, source, bars, named)
+        source.data = {**source.data, "half": above, "low": np.asarray(y) - below, "high": np.asarray(y) + above}
+        ends = {"x0": "x", "y0": "low", "x1": "x", "y1": "high"}
+        draw(drawn, Segment, **common, **ends, line_width=1.3)
     if line:
-        course = Line(x="x", y="y", line_color=colour, line_dash=dash, line_width=width)
-        parts.append(add_mark(drawn, source, course, named))
+        parts.append(draw(drawn, Line, **common, x="x", y="y", line_dash=dash, line_width=width))
     if marker is not None:
-        points = Scatter(x="x", y="y", marker=value(marker), size=size, line_color=colour, fill_color=colour)
-        parts.append(add_mark(drawn, source, points, named))
+        parts.append(draw(drawn, Scatter, **common, x="x", y="y", marker=value(marker), size=size, fill_color=colour))
     (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
     bars_shown = "" if half is None else " ± @half{0.000}" if np.ndim(half) == 1 else " (@low{0.000} to @high{0.000})"
     tips = [
@@ -267,9 +282,9 @@ def add_ordered_lines(
     """Draw one line for each value of an ordered quantity, such as a cycle, with colour bar and values under the pointer."""
     (along, x_unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
     source = {"xs": list(xs), "ys": list(ys), "order": np.asarray(order, float), "colour": ordered_colours(len(order))}
-    lines = drawn.multi_line(
-        "xs", "ys", line_color="colour", line_width=1.4, hover_line_width=3.5, hover_line_color="colour", source=source
-    )
+    looks = {"xs": "xs", "ys": "ys", "line_color": "colour"}
+    hovered = MultiLine(**looks, line_width=3.5)
+    lines = draw(drawn, MultiLine, source=source, hovered=hovered, **looks, line_width=1.4)
     name, unit = _parts(label)
     tips = [(name, f"@order{{0.[000]}} {unit}"), (along, f"$x{{0.[00]}} {x_unit}"), (quantity, f"$y{{0.00}} {y_unit}")]
     add_hover(drawn, tips, [lines])
@@ -288,9 +303,8 @@ def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, co
     valid = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
     for piece in np.split(np.arange(x.size), np.flatnonzero(np.diff(valid.astype(int))) + 1):
         if piece.size and valid[piece[0]]:
-            ends = ColumnDataSource({"x": x[piece], "y1": low[piece], "y2": high[piece]})
-            area = VArea(x="x", y1="y1", y2="y2", fill_color=colour, fill_alpha=0.18)
-            add_mark(drawn, ends, area, name, level="underlay")
+            ends = {"x": x[piece], "y1": low[piece], "y2": high[piece]}
+            draw(drawn, VArea, **ends, fill_color=colour, fill_alpha=0.18, named=name, level="underlay")
 
 
 def add_colour_bar(
@@ -354,11 +368,7 @@ def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
 
 
 def _prepare(chart: Chart) -> None:
-    """Take from a chart what no page needs, and add what it lets the reader download."""
-    for renderer in (renderer for plot in _plots(chart) for renderer in plot.renderers):
-        if isinstance(renderer, GlyphRenderer):
-            # Looks of what is not selected or muted, which Bokeh adds to every mark: a page has no tool that selects or mutes.
-            renderer.update(nonselection_glyph=None, muted_glyph=None)
+    """Add to a chart what it lets the reader download."""
     columns = {heading: _compact(np.asarray(values)) for heading, values in chart.columns.items()}
     chart.figure.tags = [ColumnDataSource(columns), *chart.figure.tags]
 

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from bokeh.models import Quad
 from bokeh.plotting import figure
 
 from fusion.common import own_name
 from fusion.report.charts.plan import add_marks, add_names, draw_both, draw_picture
-from fusion.report.charts.style import DIVERGING, Chart, Courses, add_series, new_figure, of_rank, span_words
+from fusion.report.charts.style import DIVERGING, Chart, Courses, add_series, draw, new_figure, of_rank, span_words
 from fusion.results.numbers import fixed
 from interferometry.plots import ACCENT
 from thermography.evaluation import count_temperatures, read_profile
@@ -166,8 +167,12 @@ def plot_histogram(picture: xr.Dataset) -> Chart:
     most = float(values[counts.values.argmax()])
     drawn = new_figure(x="temperature / °C", y="pixels", y_type="log", height=300)
     some = counts.values > 0
-    sides = {"left": (values - width / 2)[some], "right": (values + width / 2)[some], "top": counts.values[some]}
-    drawn.quad(**sides, bottom=0.5, color=ACCENT, line_color="#ffffff")
+    sides: dict[str, Any] = {
+        "left": (values - width / 2)[some],
+        "right": (values + width / 2)[some],
+        "top": counts.values[some],
+    }
+    draw(drawn, Quad, **sides, bottom=0.5, fill_color=ACCENT, line_color="#ffffff")
     seen = f"Histogram of {int(counts.sum())} pixels within the calibrated range, most at {fixed(most, 1)} °C."
     warmer = counts.values[::-1].cumsum()[::-1]
     return Chart(
