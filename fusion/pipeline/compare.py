@@ -92,7 +92,7 @@ def _axis(folder: Path) -> str:
 
 
 def _drift(path: Path) -> xr.Dataset | None:
-    """Return the joint estimate of deviations.nc with its positions, without what belongs to single readings."""
+    """Return the joint estimate of deviations.nc with its positions; of what belongs to single readings the drift alone."""
     if not path.is_file():
         return None
     require_own(path.parent, [path.name])
@@ -100,7 +100,7 @@ def _drift(path: Path) -> xr.Dataset | None:
         if not has(require_kind(stored, "deviations", path), "drift"):
             return None
         drift = group(stored, "drift").assign(position=stored["position"])
-        return drift.drop_dims("cycle").load()
+        return drift.drop_vars([name for name in drift if "cycle" in drift[name].dims and name != "drift"]).load()
 
 
 # Two campaigns that `thermofuse run` ran: joint.json, joint.nc, the page joint.html, and what both agree on in either report.

@@ -94,18 +94,25 @@ def conclude_table(pair: PairComparison) -> list[str]:
     missed = [one.quantity for one in pair.achieved if not one.as_predicted]
     blind = [one.quantity for one in pair.achieved if one.as_predicted and not one.told]
     kept = [one.quantity for one in pair.achieved if one.as_predicted and one.told]
-    return sentences("table_outcome", pair.table, kept, missed, blind)
+    elsewhere = any(one.predicted == one.stated for one in pair.achieved)
+    return sentences("table_outcome", pair.table, kept, missed, blind, elsewhere)
 
 
 def achieved_table(pair: PairComparison) -> Table:
     """Return the values before a table, as predicted with it and as achieved."""
     rows = []
     for one in pair.achieved:
-        values = [quantity(value) for value in (one.before, one.predicted, one.achieved, one.difference)]
+        values = [quantity(value) for value in (one.before, one.stated, one.predicted, one.achieved, one.difference)]
         within = "within the uncertainty" if one.told else "not told: the uncertainty covers the value as found, too"
         verdict = within if one.as_predicted else "beyond the uncertainty"
         rows.append(Row([ISO230_TERMS[one.quantity], *values, verdict], marked=not one.as_predicted))
-    heads = ("as found / µm", "predicted / µm", "achieved / µm", "achieved − predicted / µm")
+    heads = (
+        "as found / µm",
+        "stated with the table / µm",
+        "in this thermal state / µm",
+        "achieved / µm",
+        "achieved less that / µm",
+    )
     return table([Words("Quantity (k = 2)"), *heads, Words("Verdict")], rows)
 
 

@@ -26,6 +26,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
+from fusion.analysis.predicted_test import APPROACHES
 from fusion.common import Array, FusionError
 from fusion.report.wording import environment, say, sentences
 from fusion.results.loop import RecordLoop
@@ -43,8 +44,6 @@ class ExportError(FusionError):
 # The drift-free profile of an axis as a compensation needs it: relative to a reference, at the points of a table,
 # with its uncertainty.
 
-#: Order of the approaches along the first axis of every array.
-APPROACHES = ("positive", "negative")
 _SPACING_TOLERANCE_MM = 1e-3
 
 
@@ -159,30 +158,6 @@ def read_profile(deviations: xr.Dataset) -> Profile:
     return Profile(
         position, deviation, covariance.transpose("direction", "target", "other_direction", "other_target").values
     )
-
-
-def read_scatter_and_drift(deviations: xr.Dataset) -> tuple[Array, Array, float]:
-    """Return the standard deviation of a reading (2, n) and the drift (cycles, 2, n), um, as `read_profile` orders them, and the degrees
-    of freedom of the former.
-
-    Variances are drawn towards their mean as far as they differ by no more than chance (empirical Bayes: Smyth 2004, 3.3).
-    """
-    order = np.argsort(deviations["position"].values)
-    drift = group(deviations, "drift").sel(direction=list(APPROACHES)).isel(target=order)
-    scatter = drift["scatter"].fillna(drift["scatter_position"]).transpose("direction", "target").values.astype(float)
-    freedom = np.nan_to_num(drift["scatter_freedom"].transpose("direction", "target").values.astype(float))
-    variance, known = scatter**2, (scatter > 0.0) & (freedom > 0.0)
-    if known.any():
-        common = float(np.average(variance[known], weights=freedom[known]))
-        excess = float(np.var(np.log(variance[known])) - np.mean(special.polygamma(1, freedom[known] / 2.0)))
-        # The inverse of the trigamma function, 1/x + 1/(2 x²), at half the degrees of freedom of the common variance.
-        prior = (1.0 + math.sqrt(1.0 + 2.0 * excess)) / excess if excess > 0.0 else math.inf
-        own = np.where(known, freedom / (freedom + prior), 0.0)
-        scatter = np.sqrt(own * np.where(known, variance, 0.0) + (1.0 - own) * common)
-    # Where a reading is missing, the drift went on.
-    course = drift["drift"].interpolate_na("cycle", fill_value="extrapolate").transpose("cycle", "direction", "target")
-    total = float(freedom[known].sum()) or np.inf
-    return scatter, course.values.astype(float), total
 
 
 def tabulate(

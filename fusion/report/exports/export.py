@@ -15,6 +15,7 @@ import pandas as pd
 import xarray as xr
 
 from fusion.analysis.drift_model.recursion import make_recursion
+from fusion.analysis.predicted_test import predict_values, scatter_and_drift
 from fusion.common import Array
 from fusion.messages import naming
 from fusion.report.exports import maps, tables
@@ -34,7 +35,6 @@ from fusion.report.exports.controls import (
     read_active,
     read_origin,
     read_profile,
-    read_scatter_and_drift,
     read_thermal_state,
     siemens_temperature,
     tabulate,
@@ -44,7 +44,7 @@ from fusion.results.axis import AnomalyPart
 from fusion.results.loop import RecordLoop
 from fusion.results.parts import PREDICTION_ENDING, ByDirection, Quantity, TablePrediction
 from fusion.results.results import Results, read_results
-from fusion.results.store import file_sha256, has, read_product, write_atomically
+from fusion.results.store import file_sha256, group, has, read_product, write_atomically
 from interferometry.iso230 import STANDARD_CYCLES
 from thermography.common import write_csv
 
@@ -67,8 +67,6 @@ def _moves(anomaly: AnomalyPart) -> bool:
 
 
 # What a compensation table is predicted to do.
-
-_DRAWS, _SEED = 400, 20260309
 
 
 def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> dict[str, float]:
@@ -96,51 +94,12 @@ def predict_test(
     cycles: int,
     one_table: bool,
 ) -> dict[str, Quantity]:
-    """Predict A, E, M and B of a test of so many cycles with an active table: median over tests, each with its own readings.
-
-    `scatter_um` (2, n) is the standard deviation of a reading, known with this freedom, `drift_um` (cycles, 2, n) the drift, which no table
-    corrects: every test has that of some successive cycles. The errors of the profile are those of the table too.
-    """
-    if not (np.isfinite(scatter_um).all() and np.isfinite(drift_um).all()):
-        return {}
-    rng, left = np.random.default_rng(_SEED), remainder_um(profile, table, one_table=one_table)
-    errors = rng.multivariate_normal(
-        np.zeros(left.size), profile.covariance_um2.reshape(left.size, left.size), _DRAWS, method="eigh"
-    ).reshape(_DRAWS, *left.shape)
-    if one_table:
-        left, errors = _with_likely_reversal(left, errors)
-    if np.isfinite(freedom):
-        scatter_um = scatter_um * np.sqrt(freedom / rng.chisquare(freedom, _DRAWS))[:, None, None]
-    mean = left - errors + scatter_um / cycles**0.5 * rng.standard_normal((_DRAWS, *left.shape))
-    first = rng.integers(0, max(1, len(drift_um) - cycles + 1), _DRAWS)
-    states = [drift_um[start : start + cycles] for start in first]
-    mean = mean + [state.mean(axis=0) for state in states]
-    drifted = np.array([state.var(axis=0, ddof=1 if len(state) > 1 else 0) for state in states])
-    # Readings that drift and scatter about their mean: squares of normal values that are not about zero.
-    variance = np.broadcast_to(np.maximum(scatter_um**2, 1e-12), mean.shape) / (cycles - 1)
-    spread = 2.0 * np.sqrt(variance * rng.noncentral_chisquare(cycles - 1, drifted / variance))
-    drawn = {
-        "A": (mean + spread).max(axis=(1, 2)) - (mean - spread).min(axis=(1, 2)),
-        "E": np.ptp(mean, axis=(1, 2)),
-        "M": np.ptp(mean.mean(axis=1), axis=1),
-        "B": np.abs(mean[:, 0] - mean[:, 1]).max(axis=1),
-    }
-    return {
-        symbol: Quantity(value=float(np.median(values)), u=float(values.std(ddof=1)))
-        for symbol, values in drawn.items()
-    }
-
-
-def _with_likely_reversal(left: Array, errors: Array) -> tuple[Array, Array]:
-    """Return what one table leaves (2, n) and the errors of the profile (draws, 2, n) with the variation of the reversal that is likely.
-
-    That variation is left as measured, errors included: of its variance only what exceeds theirs is the axis (Wiener's share).
-    """
-    seen, wrong = (one[..., 0, :] - one[..., 1, :] for one in (left, errors))
-    wrong = wrong - wrong.mean(axis=-1, keepdims=True)
-    share = max(0.0, 1.0 - float(np.mean(wrong**2)) / max(float(np.mean(seen**2)), 1e-12))
-    halves = np.array([[0.5], [-0.5]])
-    return left - (1.0 - share) * halves * seen, errors - (1.0 - share**0.5) * halves * wrong[:, None]
+    """Predict A, E, M and B of a test with an active table, which has the drift of some successive cycles of this one."""
+    courses = [drift_um[start : start + cycles] for start in range(max(1, len(drift_um) - cycles + 1))]
+    left = remainder_um(profile, table, one_table=one_table)
+    return predict_values(
+        left, profile.covariance_um2, scatter_um, courses, freedom, cycles=cycles, one_table=one_table
+    )
 
 
 def remainder_um(profile: Profile, table: ErrorTable, *, one_table: bool) -> Array:
@@ -353,8 +312,9 @@ def _predict_test(run: _Run, profile: Profile, table: ErrorTable, control: Contr
     iso = run.results.iso230
     cycles = len(iso.cycles) if iso is not None and iso.cycles else STANDARD_CYCLES
     forward, reverse = table.added_um(table.position_mm, one_table=control.one_table).tolist()
+    drift = group(run.deviations, "drift").assign(position=run.deviations["position"])
     predicted = predict_test(
-        profile, table, *read_scatter_and_drift(run.deviations), cycles=max(cycles, 2), one_table=control.one_table
+        profile, table, *scatter_and_drift(drift), cycles=max(cycles, 2), one_table=control.one_table
     )
     return TablePrediction(
         table=file,

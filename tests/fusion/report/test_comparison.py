@@ -76,12 +76,20 @@ def test_a_change_beyond_its_stated_uncertainty_is_not_said_to_lie_within_it(pai
 def test_predicted_and_achieved_stand_beside_each_other(pairs):
     def one(symbol, achieved):
         difference = Quantity(value=achieved - 1.0, u=0.5)
-        known = (Quantity(value=9.0, u=1.0), Quantity(value=1.0, u=0.1), Quantity(value=achieved, u=0.4))
+        stated = Quantity(value=2.0, u=0.2)
+        known = (Quantity(value=9.0, u=1.0), stated, Quantity(value=1.0, u=0.1), Quantity(value=achieved, u=0.4))
         return Achieved(symbol, *known, difference)
 
     pair = replace(pairs[0], achieved=(one("A", 3.0), one("E", 1.5)))
     a, e = achieved_table(pair).rows
-    assert a.cells[1:] == ["9.0 ± 2.0", "1.00 ± 0.20", "3.00 ± 0.80", "2.0 ± 1.0", "beyond the uncertainty"]
+    assert a.cells[1:] == [
+        "9.0 ± 2.0",
+        "2.00 ± 0.40",
+        "1.00 ± 0.20",
+        "3.00 ± 0.80",
+        "2.0 ± 1.0",
+        "beyond the uncertainty",
+    ]
     assert a.marked and not e.marked and not pair.is_kept
     assert conclude_table(pair)[0].startswith("With the table A differs from the prediction")
     kept = replace(pair, achieved=(one("E", 1.5),))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from fusion.analysis.predicted_test import scatter_and_drift
 from fusion.report.exports.controls import (
     CONTROLS,
     ErrorTable,
@@ -17,7 +18,6 @@ from fusion.report.exports.controls import (
     path_variance,
     read_active,
     read_profile,
-    read_scatter_and_drift,
     read_twincat,
     siemens840d,
     siemens_temperature,
@@ -25,7 +25,7 @@ from fusion.report.exports.controls import (
     twincat,
 )
 from fusion.report.exports.export import predict, predict_test, remainder_um
-from fusion.results.store import read_dataset
+from fusion.results.store import group, read_dataset
 from tests.fusion.report.exports.small_run import (
     SHIFT_UM_PER_K,
     STRETCH_PPM_PER_K,
@@ -333,11 +333,12 @@ def test_the_reversal_that_one_table_leaves_is_counted_without_the_noise_of_its_
 
 def test_scatter_of_few_cycles_is_drawn_together_where_it_differs_by_chance(small_run):
     deviations = read_dataset(small_run / "deviations.nc")
-    own = deviations["drift_scatter"].values
-    scatter, *_ = read_scatter_and_drift(deviations)
+    drift = group(deviations, "drift").assign(position=deviations["position"])
+    own = drift["scatter"].values
+    scatter, *_ = scatter_and_drift(drift)
     assert np.ptp(scatter) < 0.5 * np.ptp(own) and np.sqrt(np.mean(scatter**2)) == pytest.approx(0.05, rel=0.15)
-    far = deviations["drift_scatter"].where(deviations["target"] != 3, 1.0)
-    assert read_scatter_and_drift(deviations.assign(drift_scatter=far))[0].max() > 0.8
+    far = drift["scatter"].where(drift["target"] != 3, 1.0)
+    assert scatter_and_drift(drift.assign(scatter=far))[0].max() > 0.8
 
 
 def test_a_coarse_table_leaves_more_and_says_so(small_run):
