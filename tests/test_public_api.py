@@ -85,6 +85,7 @@ def test_the_root_module_re_exports_names_of_the_packages():
         thermofuse.nothing  # noqa: B018
 
 
+@pytest.mark.long
 def test_each_package_has_one_error_base_class():
     for package, base in zip(PACKAGES, ("ThermographyError", "InterferometryError", "FusionError"), strict=True):
         root = getattr(importlib.import_module(package), base)

@@ -21,6 +21,7 @@ from fusion.app.parts import State
 from fusion.campaign.config import CampaignError
 from fusion.pipeline.watch import Enough, FinishedCycle, LiveState
 from tests.fusion.app.texts import texts
+from tests.fusion.campaign_parts import keep_cycles
 
 NAT = np.datetime64("NaT", "ns")
 
@@ -109,11 +110,12 @@ def test_a_missing_campaign_and_one_outside_the_folder_are_named(tmp_path):
 
 
 def test_a_test_is_followed_and_stopped_by_keyboard(app, new_page):
+    keep_cycles(app[1] / "laser.csv", *range(1, 7))
     page = new_page(app[0], width=390)
     page.get_by_role("button", name="Live", exact=True).press("Enter")
     page.get_by_role("button", name="Follow", exact=True).press("Enter")
-    page.get_by_text("Following: 23 finished cycles").wait_for(timeout=60_000)
+    page.get_by_text("Following: 5 finished cycles").wait_for(timeout=60_000)
     page.get_by_role("button", name="Stop following").press("Enter")
-    page.get_by_text("No longer followed: 24 finished cycles").wait_for(timeout=60_000)
+    page.get_by_text("No longer followed: 6 finished cycles").wait_for(timeout=60_000)
     page.get_by_text("Temperature of the table in cycle").wait_for()
     page.wait_for_function("document.documentElement.scrollWidth <= 390")

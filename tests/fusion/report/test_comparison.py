@@ -258,6 +258,7 @@ def test_bars_of_a_trend_leave_out_what_all_tests_have_in_common(tmp_path):
     assert trend.half == pytest.approx([6.0] * 3)
 
 
+@pytest.mark.long
 def test_a_last_value_outside_its_limits_leads_the_document(tmp_path):
     folders = []
     for k, a_um in enumerate([9.0, 9.2, 9.1, 9.3, 9.0, 9.2, 9.1, 9.3, 12.0]):

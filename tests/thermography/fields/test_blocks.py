@@ -65,6 +65,7 @@ def test_blocks_hold_a_limited_number_of_frames(small, registration, monkeypatch
     assert cuts(blocks) == [(0, 3), (3, 6), (6, 9), (9, 10)]
 
 
+@pytest.mark.long
 def test_a_block_is_the_mean_of_its_calibrated_frames(registration, rng, tmp_path):
     scene = Scene(disc_K=-4.0)
     images = [replace(scene, shift_px=(0.4, 0.0)).render(rng), *(scene.render(rng) for _ in range(9))]

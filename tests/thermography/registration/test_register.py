@@ -87,12 +87,12 @@ def test_uncertainty_map_covers_the_true_error(rng):
     image = scene.render()
     places = np.array([(20.0, 20.0), (350.0, 90.0), (680.0, 160.0), (350.0, 10.0)])
     ratios = []
-    for _ in range(4):
+    for _ in range(2):
         registration = register(image + rng.normal(0, 0.2, image.shape), hinted(scene, rng, 2), grid=GRID)
         error = np.linalg.norm(scene.to_plan(registration.to_sensor(places)) - places, axis=1)
         ratios.append(error / registration.position_u(places))
-    # u states the root of the mean square error; 16 ratios that share 4 registrations give it to about 35 %.
-    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+    # u states the root of the mean square error; 8 ratios that share 2 registrations give it to about 50 % (many: tests/soak).
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.8
 
 
 def test_low_contrast_in_one_frame_is_lifted_by_averaging(rng):

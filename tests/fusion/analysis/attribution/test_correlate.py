@@ -33,6 +33,7 @@ def thin(field):
     return field[:, ::2, ::2]
 
 
+@pytest.mark.long
 def test_a_source_that_drives_the_axis_is_found_where_it_is(rng):
     made = simulator.driven_session(rng, source=0)
     before = made.fused.copy(deep=True), made.field.copy(deep=True)

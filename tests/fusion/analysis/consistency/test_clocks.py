@@ -31,6 +31,7 @@ from tests.fusion.analysis.consistency.twin_fields import (
 from tests.soak.lies.logs import starts
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("effect", ["", "unseen_heat_source", "thermal_lag"])
 def test_sound_clocks_pass(effect: str) -> None:
     test = recorded(effect=effect)

@@ -71,6 +71,7 @@ def doubted(comparison: AxisLine) -> bool:
     return not check.passed
 
 
+@pytest.mark.long
 def test_the_true_line_has_no_better_alternative() -> None:
     fields = heated_table()
     comparison = compared(readings_of(fields, TRUE), fields, TRUE)

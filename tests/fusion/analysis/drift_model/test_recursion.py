@@ -51,6 +51,12 @@ def driven() -> tuple[Record, xr.Dataset, RecordLoop]:
     return run_of(twin_table(source, seed=3))
 
 
+@pytest.fixture(scope="module")
+def stepped() -> tuple[Record, xr.Dataset, RecordLoop]:
+    """A machine with a step that is found."""
+    return run_of(twin_table(EffectRecipe("step_event", 6.0, parameters={"at_cycle": 9}), seed=5))
+
+
 def readings_of(model: Recursion, record: Record) -> np.ndarray:
     """Readings (blocks, inputs) as the control gets them."""
     return np.column_stack(
@@ -225,18 +231,16 @@ def test_results_of_an_earlier_version_are_refused(driven):
         make_recursion(product.drop_vars("driver_square"), loop, sampling_s=1.0, **FROM)
 
 
-def test_an_event_is_in_the_fit_and_not_in_the_recursion():
-    step = EffectRecipe("step_event", 6.0, parameters={"at_cycle": 9})
-    record, product, loop = run_of(twin_table(step, seed=5))
+def test_an_event_is_in_the_fit_and_not_in_the_recursion(stepped):
+    record, product, loop = stepped
     assert "step_event" in [one.effect for one in loop.steps]
     model = make_recursion(product, loop, sampling_s=record.block_s, **FROM)
     assert "not contained, because no reading shows it: step_event" in model.remarks
     assert {one.name for one in model.inputs} <= {*record.sensors, *record.drivers}
 
 
-def test_a_displacement_that_a_part_does_not_hold_takes_no_part_there():
-    step = EffectRecipe("step_event", 6.0, parameters={"at_cycle": 9})
-    record, product, loop = run_of(twin_table(step, seed=5))
+def test_a_displacement_that_a_part_does_not_hold_takes_no_part_there(stepped):
+    record, product, loop = stepped
     empty = product.copy(deep=True)
     part = product["part"].values == product["part"].values[record.seconds.size // 3]
     empty["displacement"].values[part, 1] = np.nan
