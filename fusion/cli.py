@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import re
-import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -31,7 +30,6 @@ from fusion.messages import (
     printable,
 )
 from fusion.pipeline.workers import collect_garbage_less, second_process
-from thermofuse.__main__ import stop_at_once
 
 if TYPE_CHECKING:
     from fusion.results.progress import Report
@@ -904,9 +902,7 @@ def plan(
 
 
 def main() -> None:
-    """Run the command line, as the script ``thermofuse`` or as a module; the exit code is that of the process."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop_at_once)
+    """Run the command line for `thermofuse.__main__`; the exit code is that of the process."""
     collect_garbage_less()
     # A service may start the command with its outputs closed: what is said goes nowhere then.
     sys.stdout, sys.stderr = (
@@ -923,7 +919,3 @@ def main() -> None:
         app(prog_name="thermofuse")
     except SystemExit as ended:
         leave(ended.code if isinstance(ended.code, int) else ExitCode.DONE)
-
-
-if __name__ == "__main__":
-    main()

@@ -197,7 +197,7 @@ def start_run(
 
     Variables of `usual` apply where the environment does not set them.
     """
-    command = [sys.executable, "-P", "-m", "fusion.cli", "run", str(campaign), "--out", str(results), *options]
+    command = [sys.executable, "-P", "-m", "thermofuse", "run", str(campaign), "--out", str(results), *options]
     command += ["--resume"] if resume else []
     environment = {**(usual or {}), **os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment, **process)

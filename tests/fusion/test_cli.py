@@ -210,7 +210,7 @@ def test_json_is_json_in_any_encoding(tmp_path: Path, encoding: str) -> None:
     name = "µ €\U0001d6b9.csv"
     (tmp_path / name).write_text("no table")
     done = subprocess.run(
-        [sys.executable, "-m", "fusion.cli", "inspect", str(tmp_path / name), "--json"],
+        [sys.executable, "-m", "thermofuse", "inspect", str(tmp_path / name), "--json"],
         capture_output=True,
         env=os.environ | {"PYTHONIOENCODING": encoding},
         check=False,
@@ -411,6 +411,6 @@ def test_a_report_is_written_as_what_its_file_is_called(
 def test_a_command_whose_outputs_are_closed_ends_as_it_would(tmp_path: Path) -> None:
     """As some services start programs."""
     laser = write_laser(tmp_path / "campaign", 3, 2).parent / "laser.csv"
-    command = f'exec "$0" -m fusion.cli iso230 "$1" --json --out "{tmp_path}/sheet.html" >&- 2>&-'
+    command = f'exec "$0" -m thermofuse iso230 "$1" --json --out "{tmp_path}/sheet.html" >&- 2>&-'
     ended = subprocess.run(["sh", "-c", command, sys.executable, str(laser)], check=False)
     assert ended.returncode == 0 and (tmp_path / "sheet.html").is_file()

@@ -14,7 +14,7 @@ RECIPE = '[campaign]\ntitle = "A machining centre"\nseed = 44\n[record]\nhours =
 
 
 def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    words = [sys.executable, "-m", "fusion.cli", *map(str, arguments)]
+    words = [sys.executable, "-m", "thermofuse", *map(str, arguments)]
     return subprocess.run(words, capture_output=True, text=True, check=False)
 
 

@@ -22,7 +22,7 @@ _OF_THE_RUN = {"provenance.json", "manifest.json", "report.html"}
 
 
 def start(campaign: Path, out: Path) -> subprocess.Popen[str]:
-    words = [sys.executable, "-m", "fusion.cli", "run", str(campaign), "--out", str(out), "--resume"]
+    words = [sys.executable, "-m", "thermofuse", "run", str(campaign), "--out", str(out), "--resume"]
     return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 

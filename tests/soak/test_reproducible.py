@@ -14,7 +14,7 @@ THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_
 
 def command(*arguments: str | Path, threads: int = 1) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, **dict.fromkeys(THREADS, str(threads))}
-    words = [sys.executable, "-m", "fusion.cli", *map(str, arguments)]
+    words = [sys.executable, "-m", "thermofuse", *map(str, arguments)]
     return subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
 
 

@@ -21,7 +21,7 @@ from tests.browser import CHROMIUM, record_faults
 @contextmanager
 def started(folder: Path) -> Iterator[str]:
     """Start `thermofuse app` for a folder; yields the address that it prints."""
-    command = [sys.executable, "-m", "fusion.cli", "app", str(folder)]
+    command = [sys.executable, "-m", "thermofuse", "app", str(folder)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
     ) as process:

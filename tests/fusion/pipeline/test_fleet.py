@@ -126,7 +126,7 @@ def test_campaigns_whose_names_differ_by_a_slash_have_logs_of_their_own(hall, tm
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT that is sent to one process")
 def test_a_fleet_that_is_stopped_ends_cleanly_with_what_was_kept(hall, tmp_path):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "fusion.cli", "fleet", str(hall), "--out", str(out), "--jobs", "1"]
+    command = [sys.executable, "-m", "thermofuse", "fleet", str(hall), "--out", str(out), "--jobs", "1"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fleet:
         deadline = time.monotonic() + 60
         while not (runs := psutil.Process(fleet.pid).children()) and time.monotonic() < deadline:
