@@ -750,18 +750,8 @@ def _describe(
     }
     reason = next((words for words, holds in reasons.items() if holds), "")
     limit = found.ratio / suspicion.excess
-    return SensorFault(
-        suspicion.sensor,
-        kind,
-        not reason,
-        ramp.begin_s,
-        ramp.begin_u_s,
-        ramp.size_K,
-        found.ratio,
-        limit,
-        reason,
-        ramp.end_s,
-    )
+    changed = ramp.begin_s, ramp.begin_u_s, ramp.size_K, found.ratio, limit, reason, ramp.end_s
+    return SensorFault(suspicion.sensor, kind, not reason, *changed)
 
 
 def _shared_by_others(grid: Grid, sensor: int, others: list[int]) -> float:

@@ -10,7 +10,7 @@ chaining: many alike sensors determine their coefficients badly, and such coeffi
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -1260,10 +1260,10 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
     Whether they do is asked of the training time alone.
     """
     table, set_points = without_set_points(table)
-    regulated = np.flatnonzero(np.isin(table["sensor"].values, [*set_points.values()])).tolist()
+    names = [str(name) for name in table["sensor"].values]
+    regulated = [names.index(one) for one in {*set_points.values()}]
     cleaned, readings = without_faulty_readings(table, regulated)
     sensors = _examine_runs(cleaned, regulated)
-    names = [str(name) for name in table["sensor"].values]
     dead = {name for fault, name, _ in sensors if fault.kind is Kind.NO_SIGNAL}
     if dead.issuperset(names):
         told = "; ".join(f"{name}: {fault.kind} from {fault.onset_s / 3600.0:.2f} h on" for fault, name, _ in sensors)
@@ -1272,80 +1272,108 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
         )
     if not readings and not sensors:
         return SensorHealth(table, set_points=set_points)
-    alive = [name for name in names if name not in dead]
+    learnt = {name for fault, name, run in sensors if _is_learnt(cleaned, fault, run)}
+    asked = _Asked(table, cleaned, declared, tuple(name for name in names if name not in dead))
+    computed = _computed(asked, [one for one in sensors if one[1] in learnt])
+    channels = [str(name) for name in table["channel"].values if name not in computed]
+    names_causes, proven = bool(channels), {one.computed_with for one in computed.values()}
+    if not names_causes:
+        # Every displacement needs the faulty sensor then: it stays, and nothing is named.
+        stays = {"state": "suspected", "reason": "as every displacement is, so that both stay and no cause is named"}
+        computed, channels = {name: one.model_copy(update=stays) for name, one in computed.items()}, [*computed]
+    asked = replace(asked, read=table.sel(channel=channels), sound=cleaned.sel(channel=channels))
+    sensors = [one for one in sensors if one[1] not in learnt - proven or not asked.follows(*one)]
+    needed = set() if names_causes else proven
+    out = {name for fault, name, _ in sensors if fault.is_clear and name not in needed}
+    kept, compared = asked.put_back(
+        [name for name in names if name not in out] or list(asked.alive), learnt - dead - proven
+    )
+    before, after = (asked.errors(of, kept)[0] for of in (asked.read, asked.sound)) if readings else ({}, {})
+    found = [
+        _part(fault, name, run, *(of.get(name, _mean(of)) for of in (before, after)))
+        for fault, name, run in readings
+        if name in channels or name in kept
+    ]
+    for fault, name, run in sensors:
+        if fault.is_clear and name in kept:
+            no_better = "the displacements are predicted no better without it"
+            reason = "every displacement is computed with it" if name in needed else no_better
+            fault = replace(fault, is_clear=False, reason=reason)
+        found.append(_part(fault, name, run, *compared.get(name, ())))
+    sound = asked.sound.sel(sensor=[name for name in names if name in kept])
+    return SensorHealth(sound, (*computed.values(), *found), names_causes, set_points)
 
-    def errors(of: xr.Dataset, *used: str) -> tuple[dict[str, float], dict[str, float]]:
-        return _declared_errors(of.sel(sensor=[name for name in names if name in used]), declared)
 
-    def followed(of: xr.Dataset, fault: SensorFault, name: str, run: str) -> list[tuple[str, float, float]]:
+@dataclass(frozen=True)
+class _Asked:
+    """What the displacements of a record say of its sensors: the record as it was read and without faulty readings, and the sensors that
+    give a signal.
+    """
+
+    read: xr.Dataset
+    sound: xr.Dataset
+    declared: Sequence[str]
+    alive: tuple[str, ...]
+
+    def errors(self, of: xr.Dataset, used: Collection[str]) -> tuple[dict[str, float], dict[str, float]]:
+        """Errors with some sensors by channel, see `_declared_errors`."""
+        return _declared_errors(of.sel(sensor=[name for name in of["sensor"].values if name in used]), self.declared)
+
+    def as_read(self, sensor: str) -> xr.Dataset:
+        """The record without faulty readings but those of a sensor."""
+        temperature = self.read["temperature"].isel(time=slice(self.sound.sizes["time"]))
+        return self.sound.assign(
+            temperature=temperature.where(self.read["sensor"] == sensor, self.sound["temperature"])
+        )
+
+    def beside(self, fault: SensorFault, name: str, run: str) -> list[tuple[str, float, float]]:
         """Channels with their errors with a sensor as it was read, and as it would read without its fault."""
         read, repaired = (
-            errors(one, *alive, name)[0] for one in (_as_read(of, table, name), _repaired(of, fault, name, run))
+            self.errors(one, {*self.alive, name})[0]
+            for one in (self.as_read(name), _repaired(self.sound, fault, name, run))
         )
         return [(channel, error, repaired.get(channel, np.inf)) for channel, error in read.items()]
 
-    learnt = {name for fault, name, run in sensors if _is_learnt(cleaned, fault, run)}
-    moved = [one for one in sensors if one[1] in learnt and one[0].kind in {Kind.NO_SIGNAL, Kind.JUMP, Kind.RAMP}]
+    def follows(self, fault: SensorFault, name: str, run: str) -> bool:
+        """Whether a displacement follows what a sensor does."""
+        if fault.kind not in {Kind.JUMP, Kind.RAMP}:
+            return False
+        others = {*self.alive} - {name}
+        alone = self.errors(self.sound, others)[0] if others else {}
+        return any(
+            error < _FOLLOWED * min(repaired, alone.get(channel, np.inf))
+            for channel, error, repaired in self.beside(fault, name, run)
+        )
+
+    def put_back(self, kept: list[str], learnt: Collection[str]) -> tuple[list[str], dict[str, tuple[float, float]]]:
+        """The sensors that are kept once one after the other is put back with which the displacements are predicted better, in either way,
+        and the errors with and without each of the others.
+        """
+        without = np.array([_mean(one) for one in self.errors(self.sound, kept)])
+        tried = {
+            name: np.array([_mean(one) for one in self.errors(self.sound, [*kept, name])])
+            for name in self.read["sensor"].values.tolist()
+            if name in learnt and name not in kept
+        }
+        better = {name: float(np.fmin(*(one / np.maximum(without, 1e-12)))) for name, one in tried.items()}
+        best = min(better, key=lambda name: better[name], default="")
+        if best and better[best] < 1.0:
+            return self.put_back([*kept, best], learnt)
+        return kept, {name: (float(one[0]), float(without[0])) for name, one in tried.items()}
+
+
+def _computed(asked: _Asked, sensors: Sequence[_Found]) -> dict[str, schema.SensorFaultPart]:
+    """Displacements that are computed with a faulty sensor."""
     computed: dict[str, schema.SensorFaultPart] = {}
-    for fault, name, run in moved:
-        for channel, error, beside in followed(cleaned, fault, name, run) if fault.is_clear else ():
-            if beside >= _COMPUTED * error and _contains(_as_read(cleaned, table, name), channel, name):
+    for fault, name, run in sensors:
+        if not fault.is_clear or fault.kind not in {Kind.NO_SIGNAL, Kind.JUMP, Kind.RAMP}:
+            continue
+        for channel, error, beside in asked.beside(fault, name, run):
+            if beside >= _COMPUTED * error and _contains(asked.as_read(name), channel, name):
                 same = replace(fault, kind=Kind.COMPUTED, size=np.nan, computed_with=name, quantity="displacement")
                 same = replace(same, ratio=beside / max(error, 1e-12), limit=_COMPUTED)
                 computed.setdefault(channel, _part(same, channel, run, error, beside))
-    left = [str(name) for name in table["channel"].values if name not in computed]
-    if not left:
-        # Every displacement needs the faulty sensor then: it stays, and nothing is named.
-        stays = {"state": "suspected", "reason": "as every displacement is, so that both stay and no cause is named"}
-        computed = {name: one.model_copy(update=stays) for name, one in computed.items()}
-    proven = {one.computed_with for one in computed.values()}
-    channels, needed = left or list(computed), set() if left else proven
-    raw, cleaned = table.sel(channel=channels), cleaned.sel(channel=channels)
-
-    def is_true(fault: SensorFault, name: str, run: str) -> bool:
-        """Whether a displacement follows what a sensor does."""
-        if name not in learnt - proven or fault.kind not in {Kind.JUMP, Kind.RAMP}:
-            return False
-        others = [other for other in alive if other != name]
-        alone = errors(cleaned, *others)[0] if others else {}
-        return any(
-            error < _FOLLOWED * min(beside, alone.get(channel, np.inf))
-            for channel, error, beside in followed(cleaned, fault, name, run)
-        )
-
-    sensors = [one for one in sensors if not is_true(*one)]
-    out = {name for fault, name, _ in sensors if fault.is_clear and name not in needed}
-    kept = [name for name in names if name not in out] or alive
-    # A sensor is put back while the displacements are predicted better with it, in either way.
-    while True:
-        without = np.array([_mean(one) for one in errors(cleaned, *kept)])
-        left_out = [name for name in names if name in learnt - dead - proven - {*kept}]
-        asked = {name: np.array([_mean(one) for one in errors(cleaned, *kept, name)]) for name in left_out}
-        better = {name: float(np.fmin(*(one / np.maximum(without, 1e-12)))) for name, one in asked.items()}
-        best = min(better, key=lambda name: better[name], default="")
-        if not best or not better[best] < 1.0:
-            break
-        kept = [*kept, best]
-    found = []
-    before, after = (errors(of, *kept)[0] for of in (raw, cleaned)) if readings else ({}, {})
-    for fault, name, run in readings:
-        if name in channels or name in kept:
-            both = (of.get(name, _mean(of)) for of in (before, after))
-            found.append(_part(fault, name, run, *both))
-    for fault, name, run in sensors:
-        if fault.is_clear and name in kept:
-            computed_with = "every displacement is computed with it"
-            reason = computed_with if name in needed else "the displacements are predicted no better without it"
-            fault = replace(fault, is_clear=False, reason=reason)
-        found.append(_part(fault, name, run, *((asked[name][0], without[0]) if name in asked else ())))
-    sound = cleaned.sel(sensor=[name for name in names if name in kept])
-    return SensorHealth(sound, (*computed.values(), *found), bool(left), set_points)
-
-
-def _as_read(cleaned: xr.Dataset, table: xr.Dataset, sensor: str) -> xr.Dataset:
-    """The record without faulty readings but those of a sensor."""
-    temperature = table["temperature"].isel(time=slice(cleaned.sizes["time"]))
-    return cleaned.assign(temperature=temperature.where(table["sensor"] == sensor, cleaned["temperature"]))
+    return computed
 
 
 def _mean(errors: Mapping[str, float]) -> float:
@@ -1363,14 +1391,11 @@ def without_set_points(table: xr.Dataset) -> tuple[xr.Dataset, dict[str, str]]:
     if not moved:
         return table, pairs
     names = [*table["driver_name"].values.tolist(), *moved]
-    units = [*table["driver_units"].values.tolist(), *["degC"] * len(moved)]
+    every = [*table["driver_units"].values.tolist(), *["degC"] * len(moved)]
     values = np.column_stack([table["driver"].values, table["temperature"].sel(sensor=moved).values])
-    return table.drop_vars(["driver", "driver_units", "driver_name"]).sel(
-        sensor=[name for name in sensors if name not in pairs]
-    ).assign(
-        driver=(("time", "driver_name"), values, table["driver"].attrs),
-        driver_units=("driver_name", np.array(units, dtype=object)),
-    ).assign_coords(driver_name=names), pairs
+    kept = table.drop_vars(["driver", "driver_units", "driver_name"]).drop_sel(sensor=moved)
+    of, units = table["driver"], ("driver_name", np.array(every, object))
+    return kept.assign(driver=(of.dims, values, of.attrs), driver_units=units).assign_coords(driver_name=names), pairs
 
 
 def _is_learnt(table: xr.Dataset, fault: SensorFault, run: str) -> bool:
@@ -1404,15 +1429,8 @@ def _part(
     fault: SensorFault, name: str, run: str, with_um: float = np.nan, without_um: float = np.nan
 ) -> schema.SensorFaultPart:
     state = "readings_left_out" if fault.readings else "left_out" if fault.is_clear else "suspected"
-    errors = {"rmse_with_um": with_um, "rmse_without_um": without_um}
-    told: dict[str, Any] = {
-        **vars(fault),
-        **errors,
-        "sensor": name,
-        "kind": fault.kind.value,
-        "run": run,
-        "state": state,
-    }
+    named = {"sensor": name, "kind": fault.kind.value, "run": run, "state": state}
+    told: dict[str, Any] = {**vars(fault), **named, "rmse_with_um": with_um, "rmse_without_um": without_um}
     fields = schema.SensorFaultPart.model_fields
     return schema.SensorFaultPart(**{key: told[key] for key in fields if told[key] or fields[key].is_required()})
 
