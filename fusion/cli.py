@@ -913,7 +913,8 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     # xarray loads dask with its first array, a fifth of the time of a short command; frames on a cluster need it, and plug-ins may.
-    if "--scheduler" not in " ".join(sys.argv) and not _PLUGINS & metadata.entry_points().groups:
+    needed = "xarray" in sys.modules or "--scheduler" in " ".join(sys.argv)
+    if not needed and not _PLUGINS & metadata.entry_points().groups:
         sys.modules.setdefault("dask", None)  # type: ignore[arg-type]
     try:
         app(prog_name="thermofuse")
