@@ -32,12 +32,12 @@ class _Kernel:
     def _compile(self) -> Any:
         """The compiled function, and so those that it may call, which numba must know."""
         if self._compiled is None:
-            self._compiled, known = _compiled(self._function, self._options), self._function.__globals__
+            self._compiled, known = _compiled(self._function, **self._options), self._function.__globals__
             known |= {name: one._compile() for name, one in list(known.items()) if isinstance(one, _Kernel)}
         return self._compiled
 
 
-def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+def _compiled(function: Callable[..., Any], **options: Any) -> Any:
     import numba
 
     try:

@@ -27,7 +27,7 @@ from fusion.messages import unforeseen
 from fusion.results.folder import MANIFEST
 from fusion.results.inspection import describe_product, is_product
 from fusion.results.numbers import duration, join, moment, print_unit, span
-from fusion.results.progress import Read, clock_notices, counted, left_out_notices, listed
+from fusion.results.progress import clock_notices, counted, left_out_notices, listed
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError
 from thermography.common import ThermographyError
@@ -55,6 +55,8 @@ from thermography.io.sequence import camera_names
 from thermography.registration.plan import read_fiducials
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from fusion.campaign.columns import Column, TableProposal
 
 
@@ -439,7 +441,7 @@ def _describe_deviations(found: Recognised) -> list[str]:
     ]
 
 
-def _warnings(table: Read) -> list[str]:
+def _warnings(table: xr.Dataset) -> list[str]:
     notices = [*left_out_notices(table, "left_out"), *clock_notices(table)]
     return [f"warning: {notice.message} {notice.remedy}" for notice in notices]
 

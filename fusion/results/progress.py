@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from threading import Event, Thread
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -23,6 +23,8 @@ from rich.progress import (
 )
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from fusion.results.results import Notice
 
 
@@ -32,16 +34,7 @@ if TYPE_CHECKING:
 _NAMED = 5
 
 
-class Read(Protocol):
-    """What was read of files, with the lists of their lines as JSON in its attributes."""
-
-    @property
-    def attrs(self) -> Mapping[Any, Any]:
-        """Its attributes by name."""
-        ...
-
-
-def left_out_notices(dataset: Read, code: str) -> list[Notice]:
+def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
     """Return notices for each file that count its rejected lines and its cells without a reading, and list the first of them."""
     return [
         _notice(
@@ -52,7 +45,7 @@ def left_out_notices(dataset: Read, code: str) -> list[Notice]:
     ]
 
 
-def clock_notices(dataset: Read) -> list[Notice]:
+def clock_notices(dataset: xr.Dataset) -> list[Notice]:
     """Return one notice for each file whose clock goes back, with the first lines at which it does."""
     return [
         _notice("clock_goes_back", path=path, times=counted(len(named), "time"), named=listed(named))
@@ -66,7 +59,7 @@ def _notice(words: str, **facts: Any) -> Notice:
     return Notice.of(words, **facts)
 
 
-def _lines_by_file(dataset: Read, name: str) -> Iterator[tuple[str, list[str]]]:
+def _lines_by_file(dataset: xr.Dataset, name: str) -> Iterator[tuple[str, list[str]]]:
     """Yield the name of every file and its lines in words, from the list of lines that an attribute holds."""
     lines = json.loads(dataset.attrs.get(name, "[]"))
     for path in dict.fromkeys(item["path"] for item in lines):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from bokeh.models import BoxAnnotation, DatetimeTickFormatter, HSpan, NoOverlap, Scatter
+from bokeh.models import BoxAnnotation, DatetimeTickFormatter, NoOverlap
 
 from fusion.analysis.comparison import ComparedCampaign, PairComparison, common_to_all, contributions
 from fusion.report.charts.style import (
@@ -106,7 +106,7 @@ def plot_remaining(pair: PairComparison) -> Chart | None:
     places = sorted({one.position_mm for one in changed if one.position_mm is not None and one.quantity not in _RUNS})
     at = np.isin(x, places)
     if at.any():
-        draw(drawn, Scatter, x=x[at], y=value[at], **_RING)
+        draw(drawn, "Scatter", x=x[at], y=value[at], **_RING)
     told = [f"{place:g} mm" for place in places]
     for one in changed:
         if one.quantity in _RUNS:
@@ -203,15 +203,15 @@ def draw_trend(trend: Trend) -> Chart:
         seen += f"; control limits need {_LEAST_FOR_LIMITS + 1} tests"
     else:
         for level, dash in zip(limits, ("dashed", "solid", "dashed"), strict=True):
-            draw(drawn, HSpan, y=level, line_color=ACCENT, line_dash=dash, line_width=1.3)
+            draw(drawn, "HSpan", y=level, line_color=ACCENT, line_dash=dash, line_width=1.3)
         drawn_um.append(np.array(limits))
         at = trend.outside
         if at.any():
-            draw(drawn, Scatter, x=when[at], y=value[at], **_RING)
+            draw(drawn, "Scatter", x=when[at], y=value[at], **_RING)
         low, high = number(limits.low, 3), number(limits.high, 3)
         seen += f"; control limits {low} to {high} {unit}, {int(at.sum())} of {value.size} outside"
     if trend.tolerance is not None:
-        draw(drawn, HSpan, y=trend.tolerance, line_color=INK, line_dash="dotted", line_width=1.6)
+        draw(drawn, "HSpan", y=trend.tolerance, line_color=INK, line_dash="dotted", line_width=1.6)
         add_label(drawn, when[0], trend.tolerance, "tolerance", offset=(0, 3), size="11px")
         drawn_um.append(np.array([trend.tolerance]))
         seen += f"; tolerance {trend.tolerance:g} {unit}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from bokeh.models import HSpan
 
 from fusion.report.charts.comparison import control_limits
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, draw, new_figure, span_words
@@ -28,7 +27,7 @@ def plot_history(dates: np.ndarray, found: Mapping[str, tuple[np.ndarray, np.nda
         told = span_words(value, "µm")
         if limits is not None:
             for level, dash in zip(limits, ("dashed", "dotted", "dashed"), strict=True):
-                draw(drawn, HSpan, y=level, line_color=colour, line_dash=dash, line_width=1.1)
+                draw(drawn, "HSpan", y=level, line_color=colour, line_dash=dash, line_width=1.1)
             beyond = int(((value < limits.low) | (value > limits.high)).sum())
             told += f", control limits {number(limits.low)} to {number(limits.high)} µm, {beyond} outside"
         looks = {"half": half, "colour": colour, "marker": marker}

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from bokeh.models import FixedTicker, LinearColorMapper, Quad, Scatter
+from bokeh.models import FixedTicker, LinearColorMapper
 from bokeh.plotting import figure
 
 from fusion.analysis.levels import ATTRIBUTION_LEVEL
@@ -46,7 +46,7 @@ def _add_blank(drawn: figure, extent: Extent, name: str) -> None:
     """Hatch the plan, which shows wherever no cell is coloured."""
     left, right, bottom, top = extent
     draw(
-        drawn, Quad, left=left, right=right, bottom=bottom, top=top, fill_color="#ffffff", line_color=None,
+        drawn, "Quad", left=left, right=right, bottom=bottom, top=top, fill_color="#ffffff", line_color=None,
         hatch_pattern="right_diagonal_line", hatch_color="#9aa7ad", hatch_scale=7, hatch_weight=0.6, level="image", named=name,
     )  # fmt: skip
 
@@ -210,7 +210,7 @@ def plot_held_out_errors(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
             continue
         colour = looks["colour"]
         dots = {"line_color": colour, "fill_color": colour, "line_alpha": 0.45, "fill_alpha": 0.45}
-        draw(drawn, Scatter, x=hours.values.ravel(), y=values.values.ravel(), named=text, size=2.5, **dots)
+        draw(drawn, "Scatter", x=hours.values.ravel(), y=values.values.ravel(), named=text, size=2.5, **dots)
         parts.append(f"{text} {number(float(np.sqrt(np.nanmean(values.values**2))))} µm rms")
     seen = (
         f"Errors of predicting the {int(held.sum())} cycles that were held out: {'; '.join(parts)}; the drift as measured moves over "

@@ -7,19 +7,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import xarray as xr
-from bokeh.models import (
-    Arrow,
-    ColorMapper,
-    ColumnDataSource,
-    GlyphRenderer,
-    HoverTool,
-    Image,
-    Line,
-    LinearColorMapper,
-    NormalHead,
-    Scatter,
-    Text,
-)
+from bokeh.models import Arrow, ColorMapper, ColumnDataSource, GlyphRenderer, HoverTool, LinearColorMapper, NormalHead
 from bokeh.plotting import figure
 
 from fusion.report.charts.embedded import MapControls
@@ -92,7 +80,7 @@ def add_cells(
     left, right, bottom, top = extent
     source = {name: [each.astype(np.float32)] for name, each in {"image": values, **layers}.items()}
     place: dict[str, Any] = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom}
-    cells = draw(drawn, Image, image="image", **place, color_mapper=mapper, source=source, level="image")
+    cells = draw(drawn, "Image", image="image", **place, color_mapper=mapper, source=source, level="image")
     add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), *tips], [cells])
     return cells
 
@@ -100,7 +88,7 @@ def add_cells(
 def add_names(drawn: figure, x: Any, y: Any, names: Any, **options: Any) -> None:
     """Write names on a map, light on dark, which reads on every colour."""
     draw(
-        drawn, Text, x=x, y=y, text=names, text_color="#ffffff", text_font_size="12px", background_fill_color=INK,
+        drawn, "Text", x=x, y=y, text=names, text_color="#ffffff", text_font_size="12px", background_fill_color=INK,
         background_fill_alpha=0.75, padding=2, **options,
     )  # fmt: skip
 
@@ -135,7 +123,7 @@ def draw_picture(
     drawn.grid.grid_line_color = None
     rounded = np.round(values * _STEP_PER_K) / _STEP_PER_K
     place = {"x": -0.5, "y": -0.5, "dw": columns, "dh": rows}
-    picture = draw(drawn, Image, image=[rounded.astype(np.float32)], **place, color_mapper=mapper, level="image")
+    picture = draw(drawn, "Image", image=[rounded.astype(np.float32)], **place, color_mapper=mapper, level="image")
     name, _, unit = label.partition(" / ")
     add_hover(drawn, [("column", "$x{0}"), ("row", "$y{0}"), (name, f"@image{{0.00}} {unit}")], [picture])
     add_colour_bar(drawn, mapper, label, place="right")
@@ -154,14 +142,8 @@ def plot_registration(
     column, row = fields["fiducial_column"].values, fields["fiducial_row"].values
     residual = fields["fiducial_residual"].values
     source = {"column": column, "row": row, "name": names, "residual": residual}
-    looks: dict[str, Any] = {
-        "marker": "circle",
-        "size": 13,
-        "fill_alpha": 0.0,
-        "line_color": "#7fe3ff",
-        "line_width": 2,
-    }
-    rings = draw(drawn, Scatter, x="column", y="row", source=source, **looks)
+    looks: dict[str, Any] = {"marker": "circle", "size": 13, "fill_alpha": 0.0, "line_color": "#7fe3ff"}
+    rings = draw(drawn, "Scatter", x="column", y="row", source=source, line_width=2, **looks)
     add_names(drawn, "column", "row", "name", source=source, x_offset=9, y_offset=-4)
     if "target_x" in fields:
         draw_both(drawn, *_to_frame(fields, fields["target_x"].values, fields["target_y"].values))
@@ -209,7 +191,7 @@ def _rim(area: AreaPart) -> tuple[np.ndarray, np.ndarray]:
 def draw_both(drawn: figure, x: np.ndarray, y: np.ndarray) -> None:
     """Draw a line dark under light, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 1.6)):
-        draw(drawn, Line, x=x, y=y, line_color=colour, line_width=width)
+        draw(drawn, "Line", x=x, y=y, line_color=colour, line_width=width)
 
 
 def _on_plan(fields: xr.Dataset, shape: tuple[int, ...]) -> np.ndarray:
@@ -278,9 +260,9 @@ def plot_contact_sheet(fields: xr.Dataset) -> Chart:
     names = [f"cycle {cycle}" for cycle in cycles]
     source = {"image": list(rise.values.astype(np.float32)), "x": x, "y": y, "cycle": names}
     place: dict[str, Any] = {"x": "x", "y": "y", "dw": width, "dh": height}
-    maps = draw(drawn, Image, image="image", **place, color_mapper=mapper, source=source, level="image")
+    maps = draw(drawn, "Image", image="image", **place, color_mapper=mapper, source=source, level="image")
     add_hover(drawn, [("", "@cycle"), LAYERS[0].tip], [maps])
-    draw(drawn, Text, x=x, y=y - 0.01 * width, text=names, text_font_size="11px", text_color=INK)
+    draw(drawn, "Text", x=x, y=y - 0.01 * width, text=names, text_font_size="11px", text_color=INK)
     add_colour_bar(drawn, mapper, "rise / K")
     seen = f"Rise of the table in {len(cycles)} of {count} cycles on one scale: {span_words(rise.values, 'K')}."
     cells = rise.stack(cell=("cycle", "y", "x"))
@@ -458,7 +440,7 @@ def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[st
         name="scale",
     )  # fmt: skip
     place: dict[str, Any] = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom}
-    cells = draw(drawn, Image, image=[values.astype(np.float32)], **place, color_mapper=mapper, level="image")
+    cells = draw(drawn, "Image", image=[values.astype(np.float32)], **place, color_mapper=mapper, level="image")
     cells.name = "cells"
     add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), layer.tip], [cells])
     drawn.select_one(HoverTool).name = "reading"
@@ -526,9 +508,9 @@ def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None)
     if position is not None:
         order = np.argsort(position.sel(target=targets).values, kind="stable")
     x, y = fields["target_x"].values[order], fields["target_y"].values[order]
-    for colour, width in ((INK, 4), ("#ffffff", 1.6)):  # dark under light reads on every colour
-        draw(drawn, Line, x=x, y=y, line_color=colour, line_width=width)
-        draw(drawn, Scatter, x=x, y=y, marker="circle", size=width + 3, line_color=colour, fill_color=colour)
+    draw_both(drawn, x, y)
+    for colour, size in ((INK, 7), ("#ffffff", 4.6)):
+        draw(drawn, "Scatter", x=x, y=y, marker="circle", size=size, line_color=colour, fill_color=colour)
     if x.size > 1:
         head = NormalHead(size=11, fill_color="#ffffff", line_color=INK)
         along = np.array([x[-1] - x[-2], y[-1] - y[-2]])
@@ -582,7 +564,7 @@ def add_marks(drawn: figure, x: Any, y: Any, marker: str, size: int, **options: 
     """Draw hollow marks, light on dark, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 2)):
         looks = {"fill_color": None, "line_color": colour, "line_width": width, **options}
-        draw(drawn, Scatter, x=x, y=y, marker=marker, size=size, **looks)
+        draw(drawn, "Scatter", x=x, y=y, marker=marker, size=size, **looks)
 
 
 def _seen(

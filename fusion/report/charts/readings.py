@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from bokeh.layouts import column
-from bokeh.models import BoxAnnotation, HBar, HSpan, LayoutDOM, Line, LinearColorMapper, Quad, Scatter, Segment, Whisker
+from bokeh.models import BoxAnnotation, LayoutDOM, LinearColorMapper, Whisker
 from bokeh.models.sources import ColumnDataSource
 from bokeh.plotting import figure
 
@@ -151,7 +151,7 @@ def cycle_map(values: xr.DataArray, position: xr.DataArray, label: str) -> Chart
     drawn.grid.grid_line_color = None
     across, along = field.shape
     cells = draw(
-        drawn, Quad, left="left", right="right", bottom="bottom", top="top", line_color=None,
+        drawn, "Quad", left="left", right="right", bottom="bottom", top="top", line_color=None,
         fill_color={"field": "value", "transform": mapper},
         source={
             "left": np.repeat(left, along), "right": np.repeat(right, along), "bottom": np.tile(bottom, across),
@@ -200,21 +200,22 @@ def plot_test(quoted: xr.Dataset, position: xr.DataArray) -> Chart:
         name = ARROWS[direction]
         add_band(drawn, x, mean - 2 * s, mean + 2 * s, COLOURS[direction])
         source = ColumnDataSource({"x": x, "y": mean, "low": mean - 2 * s, "high": mean + 2 * s, "s": s})
-        draw(drawn, Line, x="x", y="y", source=source, line_width=1.6, line_color=COLOURS[direction], named=name)
+        colour = COLOURS[direction]
+        draw(drawn, "Line", x="x", y="y", source=source, line_width=1.6, line_color=colour, named=name)
         whisker = Whisker(base="x", upper="high", lower="low", source=source, line_color=COLOURS[direction])
         for head in (whisker.upper_head, whisker.lower_head):
             head.update(line_color=COLOURS[direction], size=8)
         drawn.add_layout(whisker)
         points = draw(
-            drawn, Scatter, x="x", y="y", source=source, named=name, marker=MARKERS[direction], size=7, line_color=COLOURS[direction],
-            fill_color=COLOURS[direction],
+            drawn, "Scatter", x="x", y="y", source=source, named=name, marker=MARKERS[direction], size=7, line_color=colour,
+            fill_color=colour,
         )  # fmt: skip
         tips = [("position", f"@x{{0.###}} {along}"), (f"mean {name}", f"@y{{0.00}} {unit}")]
         add_hover(drawn, [*tips, ("s", f"@s{{0.00}} {unit}")], [points])
         columns |= {f"mean, {name} / {unit}": mean, f"s, {name} / {unit}": s}
     if np.isfinite(quoted["mean_bidirectional"]).any():
         mean = quoted["mean_bidirectional"].values
-        draw(drawn, Line, x=x, y=mean, named="mean of both", line_color=INK, line_dash="dotted")
+        draw(drawn, "Line", x=x, y=mean, named="mean of both", line_color=INK, line_dash="dotted")
         _mark_reversal(drawn, quoted, x)
     _mark_spans(drawn, quoted, x[-1], room)
     return Chart(drawn, _seen(quoted, x, unit, along), columns)
@@ -229,10 +230,10 @@ def _mark_spans(drawn: figure, quoted: xr.Dataset, end: float, room: float) -> N
         if not np.isfinite(low).any():
             continue
         at, bottom, top = end + share * room, float(np.nanmin(low)), float(np.nanmax(high))
-        draw(drawn, Segment, x0=at, y0=bottom, x1=at, y1=top, line_color=INK, line_width=1.4)
+        draw(drawn, "Segment", x0=at, y0=bottom, x1=at, y1=top, line_color=INK, line_width=1.4)
         for level in (bottom, top):
             thin: dict[str, Any] = {"line_color": MUTED, "line_dash": "dashed", "line_width": 0.8}
-            draw(drawn, Segment, x0=end, y0=level, x1=at, y1=level, **thin)
+            draw(drawn, "Segment", x0=end, y0=level, x1=at, y1=level, **thin)
         # That of the outer span stands on its left: what leaves the frame is cut in a narrow chart.
         looks: dict[str, Any] = {"offset": (-4, -8), "align": "right"} if symbol == "E" else {"offset": (4, -8)}
         add_label(drawn, at, bottom + height * (top - bottom), f"{symbol} {number(top - bottom)}", **looks)
@@ -243,7 +244,7 @@ def _mark_reversal(drawn: figure, quoted: xr.Dataset, x: np.ndarray) -> None:
     reversal = quoted["reversal"].values
     k = int(np.nanargmax(np.abs(reversal)))
     ends, s = quoted["mean_unidirectional"].values[:, k], quoted["standard_deviation"].values[:, k]
-    draw(drawn, Segment, x0=x[k], y0=ends.min(), x1=x[k], y1=ends.max(), line_color=INK, line_width=3)
+    draw(drawn, "Segment", x0=x[k], y0=ends.min(), x1=x[k], y1=ends.max(), line_color=INK, line_width=3)
     top = float((ends + 2 * s).max())
     at, offset = (top, (-16, 6)) if np.isfinite(top) else (float(ends.mean()), (6, -8))
     add_label(drawn, float(x[k]), at, f"B {number(abs(reversal[k]))}", offset=offset)
@@ -317,7 +318,7 @@ def plot_reference_chart(chart: xr.Dataset, position: xr.DataArray) -> Chart:
         name, looks = ARROWS[direction], {"line_color": COLOURS[direction], "line_dash": "dashed"}
         add_series(drawn, place, value, name=name, **of_direction(direction))
         for sign in (-1, 1):
-            draw(drawn, Line, x=place, y=value + sign * border, named=f"±2 s, {direction}", **looks)
+            draw(drawn, "Line", x=place, y=value + sign * border, named=f"±2 s, {direction}", **looks)
         columns |= {f"deviation, {name} / µm": value, f"border ±, {name} / µm": border}
     seen = f"Deviation from the reference at {place[0]:g} mm: {span_words(chart['chart'], 'µm')} over {place.size} positions."
     return Chart(drawn, seen, columns)
@@ -388,7 +389,7 @@ def plot_windows(windows: xr.Dataset) -> Chart:
         x, value = middle + 0.25 * (shift - 1), short[name].values
         looks: dict[str, Any] = {"colour": colour, "marker": marker, "half": 2 * short[f"{name}_u"].values}
         courses.add(x, value, text, f"{name} / {unit}", f"U({name}), k = 2 / {unit}", **looks)
-        draw(drawn, HSpan, y=float(whole[name]), line_color=colour, line_dash="dotted", line_width=1.5)
+        draw(drawn, "HSpan", y=float(whole[name]), line_color=colour, line_dash="dotted", line_width=1.5)
     top = max(float(np.nanmax(short[name] + 2 * short[f"{name}_u"])) for name in "ARB")
     fix_range(drawn, 0.0, 1.05 * max(top, float(whole["A"])))
     seen = (
@@ -465,7 +466,7 @@ def _plot_spans(spans: dict[str, list[tuple[float, float]]]) -> figure:
         parts = spans[name]
         source = {"y": [name] * len(parts), "left": [part[0] for part in parts], "right": [part[1] for part in parts]}
         colours = {"line_color": CATEGORIES[at], "fill_color": CATEGORIES[at]}
-        bar = draw(drawn, HBar, y="y", left="left", right="right", height=0.55, source=source, **colours)
+        bar = draw(drawn, "HBar", y="y", left="left", right="right", height=0.55, source=source, **colours)
         add_hover(drawn, [("", name), ("from", "@left{0.00} h"), ("to", "@right{0.00} h")], [bar])
     return drawn
 
@@ -479,7 +480,7 @@ def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: figure
     drawn.yaxis.ticker.desired_num_ticks = 3
     low, high = shared_range(values.values)
     fix_range(drawn, low, high)
-    line = draw(drawn, Line, x=hours, y=values.values, line_color=CATEGORIES[at % len(CATEGORIES)], line_width=1.7)
+    line = draw(drawn, "Line", x=hours, y=values.values, line_color=CATEGORIES[at % len(CATEGORIES)], line_width=1.7)
     add_hover(drawn, [("time", "@x{0.00} h"), (words, f"@y{{0.00}} {literal(unit)}")], [line])
     return drawn
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from bokeh.layouts import column
-from bokeh.models import MultiLine, Plot
+from bokeh.models import Plot
 from bokeh.plotting import figure
 
 from fusion.common import own_name
@@ -95,9 +95,8 @@ def plot_temperatures(record: xr.Dataset) -> Chart:
     others = order[_NAMED:]
     if others.size:
         source = {"xs": [hours] * others.size, "ys": list(rise.T[others]), "name": [names[k] for k in others]}
-        looks: dict[str, Any] = {"xs": "xs", "ys": "ys", "line_width": 1.1}
-        hovered = MultiLine(**looks, line_color=INK)
-        lines = draw(drawn, MultiLine, source=source, named="other sensors", hovered=hovered, **looks, line_color=_PALE)
+        looks: dict[str, Any] = {"xs": "xs", "ys": "ys", "line_color": _PALE, "line_width": 1.1}
+        lines = draw(drawn, "MultiLine", source=source, named="other sensors", hovered={"line_color": INK}, **looks)
         add_hover(drawn, [("sensor", "@name"), ("time", "$x{0.00} h"), ("rise", "$y{0.00} K")], [lines])
     for rank, k in enumerate(order[:_NAMED]):
         add_series(drawn, hours, rise[:, k], name=names[k], width=2.0, **of_rank(rank))

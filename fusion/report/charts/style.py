@@ -22,25 +22,19 @@ from bokeh.models import (
     ColorMapper,
     ColumnDataSource,
     FixedTicker,
-    Glyph,
     GlyphRenderer,
     HoverTool,
-    HSpan,
     Label,
     LayoutDOM,
     Legend,
     LegendItem,
-    Line,
     LinearColorMapper,
-    MultiLine,
     PanTool,
     PlainText,
     Plot,
     Range1d,
-    Scatter,
-    Segment,
-    VArea,
     WheelZoomTool,
+    glyphs,
 )
 from bokeh.plotting import figure
 
@@ -131,7 +125,7 @@ def new_figure(
         "above",
     )  # fmt: skip
     if zero:
-        draw(drawn, HSpan, y=0.0, line_color=MUTED, line_width=1, level="underlay")
+        draw(drawn, "HSpan", y=0.0, line_color=MUTED, line_width=1, level="underlay")
     return drawn
 
 
@@ -150,29 +144,22 @@ def literal(name: str) -> str:
 
 
 def draw(
-    drawn: figure,
-    kind: type[Glyph],
-    *,
-    source: ColumnDataSource | Mapping[str, Any] | None = None,
-    named: str = "",
-    level: str = "glyph",
-    hovered: Glyph | None = None,
-    **looks: Any,
-) -> GlyphRenderer:
-    """Draw marks of one kind, arrays among their looks being columns, and name them in the legend. Bokeh's own methods make each mark
-    three times, for what is selected and what is muted.
+    drawn: figure, kind: str, *, source: Any = None, named: str = "", level: str = "glyph", hovered: Any = None, **looks: Any
+) -> GlyphRenderer:  # fmt: skip
+    """Draw marks of one of Bokeh's kinds, arrays among their looks being columns, and name them in the legend. Bokeh's own methods make
+    each mark three times, for what is selected and what is muted.
     """
     columns = {key: given for key, given in looks.items() if isinstance(given, list | np.ndarray)}
     held = source if isinstance(source, ColumnDataSource) else ColumnDataSource({**(source or {}), **columns})
-    glyph = kind(**looks | {key: key for key in columns})
-    looks_else: dict[str, Any] = {"nonselection_glyph": None, "muted_glyph": None, "hover_glyph": hovered}
-    mark = drawn.add_glyph(held, glyph, level=level, **looks_else)
-    if named:
-        item = next((item for item in drawn.legend[0].items if item.label == value(named)), None)
-        if item is None:
-            drawn.legend[0].items.append(LegendItem(label=value(named), renderers=[mark]))
-        else:
-            item.renderers.append(mark)
+    looks, made = looks | {key: key for key in columns}, getattr(glyphs, kind)
+    under = made(**looks | hovered) if hovered else None
+    others: dict[str, Any] = {"level": level, "hover_glyph": under, "nonselection_glyph": None, "muted_glyph": None}
+    mark = drawn.add_glyph(held, made(**looks), **others)
+    items = drawn.legend[0].items
+    if same := [item for item in items if item.label == value(named)]:
+        same[0].renderers.append(mark)
+    elif named:
+        items.append(LegendItem(label=value(named), renderers=[mark]))
     return mark
 
 
@@ -198,12 +185,11 @@ def add_series(
     if half is not None:
         below, above = np.broadcast_to(half, (2, len(y)))
         source.data = {**source.data, "half": above, "low": np.asarray(y) - below, "high": np.asarray(y) + above}
-        ends = {"x0": "x", "y0": "low", "x1": "x", "y1": "high"}
-        draw(drawn, Segment, **common, **ends, line_width=1.3)
+        draw(drawn, "Segment", **common, x0="x", y0="low", x1="x", y1="high", line_width=1.3)
     if line:
-        parts.append(draw(drawn, Line, **common, x="x", y="y", line_dash=dash, line_width=width))
+        parts.append(draw(drawn, "Line", **common, x="x", y="y", line_dash=dash, line_width=width))
     if marker is not None:
-        parts.append(draw(drawn, Scatter, **common, x="x", y="y", marker=value(marker), size=size, fill_color=colour))
+        parts.append(draw(drawn, "Scatter", **common, x="x", y="y", marker=value(marker), size=size, fill_color=colour))
     (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
     bars_shown = "" if half is None else " ± @half{0.000}" if np.ndim(half) == 1 else " (@low{0.000} to @high{0.000})"
     tips = [
@@ -282,9 +268,8 @@ def add_ordered_lines(
     """Draw one line for each value of an ordered quantity, such as a cycle, with colour bar and values under the pointer."""
     (along, x_unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
     source = {"xs": list(xs), "ys": list(ys), "order": np.asarray(order, float), "colour": ordered_colours(len(order))}
-    looks = {"xs": "xs", "ys": "ys", "line_color": "colour"}
-    hovered = MultiLine(**looks, line_width=3.5)
-    lines = draw(drawn, MultiLine, source=source, hovered=hovered, **looks, line_width=1.4)
+    looks: dict[str, Any] = {"xs": "xs", "ys": "ys", "line_color": "colour", "line_width": 1.4}
+    lines = draw(drawn, "MultiLine", source=source, hovered={"line_width": 3.5}, **looks)
     name, unit = _parts(label)
     tips = [(name, f"@order{{0.[000]}} {unit}"), (along, f"$x{{0.[00]}} {x_unit}"), (quantity, f"$y{{0.00}} {y_unit}")]
     add_hover(drawn, tips, [lines])
@@ -304,7 +289,7 @@ def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, co
     for piece in np.split(np.arange(x.size), np.flatnonzero(np.diff(valid.astype(int))) + 1):
         if piece.size and valid[piece[0]]:
             ends = {"x": x[piece], "y1": low[piece], "y2": high[piece]}
-            draw(drawn, VArea, **ends, fill_color=colour, fill_alpha=0.18, named=name, level="underlay")
+            draw(drawn, "VArea", **ends, fill_color=colour, fill_alpha=0.18, named=name, level="underlay")
 
 
 def add_colour_bar(

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from bokeh.models import Quad
 from bokeh.plotting import figure
 
 from fusion.common import own_name
@@ -167,12 +166,9 @@ def plot_histogram(picture: xr.Dataset) -> Chart:
     most = float(values[counts.values.argmax()])
     drawn = new_figure(x="temperature / °C", y="pixels", y_type="log", height=300)
     some = counts.values > 0
-    sides: dict[str, Any] = {
-        "left": (values - width / 2)[some],
-        "right": (values + width / 2)[some],
-        "top": counts.values[some],
-    }
-    draw(drawn, Quad, **sides, bottom=0.5, fill_color=ACCENT, line_color="#ffffff")
+    left, right = (values - width / 2)[some], (values + width / 2)[some]
+    looks: dict[str, Any] = {"fill_color": ACCENT, "line_color": "#ffffff"}
+    draw(drawn, "Quad", left=left, right=right, top=counts.values[some], bottom=0.5, **looks)
     seen = f"Histogram of {int(counts.sum())} pixels within the calibrated range, most at {fixed(most, 1)} °C."
     warmer = counts.values[::-1].cumsum()[::-1]
     return Chart(

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import math
+import os
 import re
+import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import date, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import xarray as xr
+from lxml.etree import LxmlError, SerialisationError
 from openpyxl import Workbook
 from openpyxl.cell import WriteOnlyCell
 from openpyxl.chart import BarChart, Reference, ScatterChart, Series
@@ -380,15 +385,21 @@ class Bars(NamedTuple):
 
 def write_workbook(path: Path, sheets: Mapping[str, pd.DataFrame], bars: Bars | None = None) -> None:
     """Write a workbook of tables by title, with charts of what was measured over position or time."""
-    book, made = Workbook(write_only=True), {}
-    for title, frame in sheets.items():
-        made[title] = _add_sheet(book, title, in_words(frame))
-        _add_courses(made[title], frame)
-    if bars is not None:
-        _add_bars(made, sheets[bars.table], bars)
-    # On a full disk the library's own file would be closed with a traceback for every sheet.
-    content = io.BytesIO()
-    book.save(content)
+    book, made, content = Workbook(write_only=True), {}, io.BytesIO()
+    try:
+        for title, frame in sheets.items():
+            made[title] = _add_sheet(book, title, in_words(frame))
+            _add_courses(made[title], frame)
+        if bars is not None:
+            _add_bars(made, sheets[bars.table], bars)
+        # On a full disk the library's own file would be closed with a traceback for every sheet.
+        book.save(content)
+    except SerialisationError as error:  # of the sheets' temporary files, by a name such as IO_ENOSPC
+        for stream in (part for sheet in book.worksheets for part in (sheet._rows, sheet._writer.xf)):
+            with suppress(LxmlError):
+                stream.close()
+        number = getattr(errno, str(error).removeprefix("IO_"), errno.EIO)
+        raise OSError(number, f"{os.strerror(number)}: temporary files in {tempfile.gettempdir()}") from error
     path.write_bytes(content.getvalue())
 
 

@@ -1,6 +1,8 @@
 """Exports of a folder: guarded, never overwriting in silence, with a header that the dialect can hold."""
 
+import errno
 import hashlib
+import resource
 import shutil
 from datetime import UTC, datetime
 from typing import Any
@@ -479,6 +481,18 @@ def test_fields_are_tabulated_on_request(tmp_path):
     assert list(frame) == ["cycle", "y_mm", "x_mm", "temperature_degC", "rise_K", "rise_u_K"]
     assert len(frame) == 10
     assert tables.fields_megabytes(tmp_path) == pytest.approx(12 * 43e-6)
+
+
+def test_a_workbook_without_room_for_its_temporary_files_is_refused_as_a_full_disk(tmp_path):
+    """lxml, which writes them, names neither the file nor the fault as Python does."""
+    room = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, room[1]))
+    try:
+        with pytest.raises(OSError, match="temporary files") as refused:
+            write_workbook(tmp_path / "results.xlsx", {"A": pd.DataFrame({"x": range(5000)})})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, room)
+    assert refused.value.errno == errno.EFBIG and not list(tmp_path.iterdir())
 
 
 def test_the_workbook_reads_back(small_run, tmp_path):
