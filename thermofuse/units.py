@@ -58,7 +58,8 @@ def find_unit(text: str) -> Unit | None:
         return next(alike, replace(part, name=f"{share[0].strip()} {whole.name}"))
     if written in OF_LOGGERS and written not in _WRITTEN:
         return None
-    return _WRITTEN.get(written) or _WORDS.get(written.casefold())
+    # Hours are shortened to hrs. and Std.
+    return _WRITTEN.get(written) or _WORDS.get(written.casefold().removesuffix("."))
 
 
 def conform(

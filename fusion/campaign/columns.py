@@ -15,13 +15,19 @@ import pandas as pd
 
 from fusion.campaign.config import HeaderRows, LoggedTable
 from fusion.campaign.logs import (
+    HEAD,
     MONITORED,
     PARTS,
+    ROWS_OF_VALUES,
+    VALUE,
     Rows,
+    first_of_values,
+    is_fraction,
     numbers_in,
     parts_of_time,
     read_rows,
     read_times,
+    sheet_of,
     stripped,
     text_lines,
     unwrapped,
@@ -30,6 +36,7 @@ from fusion.campaign.logs import (
 from fusion.campaign.values import (
     DAY_NUMBERS,
     TIME_UNITS,
+    column_conversion,
     column_unit,
     conversion,
     has_unit,
@@ -43,7 +50,7 @@ from fusion.common import FusionError
 from fusion.results.numbers import span
 from fusion.results.progress import listed
 from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine
-from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
+from interferometry.io.spreadsheets import cell_text, is_workbook
 from interferometry.io.tables import (
     DateOrder,
     closest_orders,
@@ -51,6 +58,7 @@ from interferometry.io.tables import (
     elapsed_s,
     fields_of,
     parse_time,
+    possible_dates,
     read_heading,
     where_clock_goes_back,
 )
@@ -66,19 +74,13 @@ _NO_NUMBERS, _NOT_KNOWN = "no numbers", "not known"
 UNIT_NOT_KNOWN = "unit not known"
 #: What only the values of a column tell: that it is a temperature, and its unit.
 _BY_VALUES, _UNIT_BY_VALUES = "by its values", "unit by its values"
+_OF_SPREAD = "spread, limit or dew point"
 _COUNTS = "whole numbers: counts? then one count with its unit, as 0.0125 mm"
 #: Comment of Klipper's logs: millimetres of one step of the motor.
 _STEP = re.compile(r"#\s*step_dist\w*\s*=\s*([\d.]+)\s*$")
-#: Lines in which the values of a table have begun.
-_HEAD = 200
-#: Rows of values, one below the other, that are no accident.
-_ROWS_OF_VALUES = 3
-#: Rows that may stand between them: an empty one, a remark, a header that is repeated.
-_ROWS_BETWEEN = 2
 #: Years in which days that are counted from a date are told by their numbers: 2000 to 2040.
 _DAYS_FROM, _DAYS_TO = 10957.0, 25568.0
 _TIME = re.compile(r"(time|t$|ts$|elapsed|seconds$|sec$|minutes$|min$|hours$|datetime|last_changed$|时间|時間)", re.I)
-_VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
 #: Marks of loggers and drivers of sensors for "no reading" that look like numbers.
 _MARKS = tuple(_VOCABULARY["marks"])
 #: Words in brackets that may be a unit, beside which a temperature has no usual one; a factor beside a unit.
@@ -88,6 +90,8 @@ _FACTOR = re.compile(r"[x×*·/]?\s*\d[\d.,eE^/+-]*\s*[x×*·]?|[x×*·]")
 _POWER_ON, _POWER_ON_JUMP = (85.0, 185.0), 5.0
 #: A mark lies this far outside the other values of its column.
 _FAR = 50.0
+#: No machine grows so far by heat, mm: an axis that moves does.
+_FARTHEST_MM = 20.0
 #: Heading that states from when seconds count, that instant, and between which numbers of seconds the years of such times lie: GPS (less
 #: the leap seconds since 2017), Unix, LabVIEW.
 _EPOCHS = (
@@ -97,6 +101,18 @@ _EPOCHS = (
 )
 #: Later seconds of Unix would be GPS times after 2030.
 _UNIX_ALONE = (1.6e9, 2.5e9)
+#: An uncertainty: u(T1), ±.
+_SPREAD = re.compile(r"^(u|s|σ)\s*\(|±|\+/?-$")
+#: An error beside the column that has it.
+_ERROR_OF = re.compile(r"(.+?)[\s_]+err(?:or)?", re.I)
+#: Units of a speed of rotation, whose sign n is that of a count too.
+_OF_SPEED = ("rpm", "RPM", "1/min", "U/min", "min-1", "min^-1", "1/s")
+#: A unit of a rate of change.
+_RATE = re.compile(r".+/\s*(s|sec|min|h|hr)")
+#: A line above a table that states units.
+_OF_UNITS = re.compile(r"\bunit|einheit|unité|unidad", re.I)
+#: Heading of a time as a channel of its own has it: Time_X, Time - X, Time.1.
+_OWN_TIME = re.compile(r"(time|zeit|temps|tiempo)(?![^\W\d_])", re.I)
 #: Headings that say what the numbers of a time of day are.
 _MINUTES_FIRST, _HOURS_FIRST = re.compile(r"\bm+:s+\b", re.I), re.compile(r"\bh+:m+", re.I)
 #: Shortest and longest thermal test, by which a number without unit is told to be seconds, minutes or milliseconds.
@@ -253,12 +269,13 @@ def propose_runs(tables: Sequence[TableProposal]) -> TableProposal:
 
 def propose_table(path: Path) -> TableProposal:
     """Read a logged table, and propose how it is laid out and what its columns hold."""
-    sheet, head = _head(path)
+    sheets, head = _head(path)
+    sheet = next(iter(sheets), None)
     keys = _of_labview(head) or _of_campbell(head) or _of_monitor(head) or _header_rows(path, head)
     header = HeaderRows.model_validate(keys["header_rows"]) if "header_rows" in keys else None
     rows = read_rows(path, sheet=sheet, header=header)
     keys |= {"sheet": sheet} if sheet else {}
-    frame, asked = rows.frame, dict[str, str]()
+    frame, asked = rows.frame, {"sheet": " or ".join(sheets[1:])} if sheets[1:] else {}
     if frame.empty:
         raise LaserFormatError(f"{path}: no rows below the header")
     units = dict[str, str]()
@@ -272,6 +289,9 @@ def propose_table(path: Path) -> TableProposal:
             columns = [replace(one, role="out") if one.remark == _BY_VALUES else one for one in columns]
     else:
         times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
+        if len(times) == 1 and "time_unit" not in asked:
+            layout = {key: value for key, value in keys.items() if key not in ("time", "header_rows", "sheet")}
+            _refuse_own_times(path, rows, LoggedTable.model_validate(layout), times[0])
         columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
         # A spreadsheet counts times in days.
         in_days = not head[0][1] and keys.get("time_unit") == "h"
@@ -279,12 +299,13 @@ def propose_table(path: Path) -> TableProposal:
         remark = UNIT_NOT_KNOWN if not_known else ""
         timed = (Column(name, "time", keys.get("time_unit", ""), _first(frame[name]), remark=remark) for name in times)
         columns = [*timed, *columns]
+    above = _units_above(rows.above)
     steps = [match[1] for _, text, _ in head if (match := _STEP.match(text))]
-    if steps:
-        columns = [
-            replace(one, unit=f"{steps[0]} mm", remark="counts, of step_dist") if one.remark == _COUNTS else one
-            for one in columns
-        ]
+    for k, one in enumerate(columns):
+        if one.role in above and one.remark == _UNIT_BY_VALUES:
+            columns[k] = replace(one, unit=above[one.role], remark="", told="line above the table")
+        elif steps and one.remark == _COUNTS:
+            columns[k] = replace(one, unit=f"{steps[0]} mm", remark="counts, of step_dist")
     if marks:
         rows = read_rows(path, sheet=sheet, header=header, missing=marks)
     time, reference, lines, refused = _read(path, rows, keys)
@@ -337,6 +358,10 @@ def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple
             found[heading].append(mark)
             rest = numbers[heading][~np.isin(numbers[heading], found[heading])]
             columns[k] = _column(heading, units.get(heading, ""), series, rest)
+    names = {name_and_unit(heading)[0] for heading in groups}
+    for k, column in enumerate(columns):
+        if (of := _ERROR_OF.fullmatch(name_and_unit(column.heading)[0])) and of[1] in names:
+            columns[k] = replace(column, role="out", remark=_OF_SPREAD)
     used = [column.heading for column in columns if column.role != "out"]
     marks = {mark for heading in used for mark in found[heading]}
     return columns, sorted(
@@ -347,21 +372,26 @@ def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple
 # Where names, units and values stand.
 
 
-def _head(path: Path) -> tuple[str | None, list[tuple[int, str, list[str]]]]:
-    """Return the sheet of a table, None for the first or a text, and its first lines that are not empty: number, text and fields."""
+def _head(path: Path) -> tuple[list[str], list[tuple[int, str, list[str]]]]:
+    """Return the sheet of a table and others like it, none of a text, and its first lines that are not empty: number, text and fields."""
     if is_workbook(path.read_bytes()):
-        sheets = {
-            name: [(line, [cell_text(cell) for cell in cells]) for line, cells in rows[:_HEAD]]
-            for name, rows in read_cells(path, as_stored=True).items()
-        }
-        first = next(iter(sheets))
-        # A sheet with remarks may stand before that with the values.
-        name = next((name for name, rows in sheets.items() if _first_of_values(rows) is not None), first)
-        return (name if name != first else None), [(line, "", fields) for line, fields in sheets[name]]
-    lines = text_lines(path)[:_HEAD]
+        name, rows, alike = sheet_of(path)
+        sheets = [name, *alike] if name else []
+        return sheets, [(line, "", [cell_text(cell) for cell in cells]) for line, cells in rows[:HEAD]]
+    lines = text_lines(path)[:HEAD]
     delimiter = delimiter_of_values(max(lines[len(lines) // 2 :], key=lambda line: len(line.strip()), default=""))
     split = ((k, line, [text.strip() for text in fields_of(line, delimiter)]) for k, line in enumerate(lines, 1))
-    return None, [row for row in split if row[1].strip()]
+    return [], [row for row in split if row[1].strip()]
+
+
+def _units_above(lines: Iterable[str]) -> dict[str, str]:
+    """Return the unit of a role that lines such as "Temperature unit: Fahrenheit" state."""
+    fields = [part.strip() for line in lines if _OF_UNITS.search(line) for part in re.split(r"[:;,=\t/]", line)]
+    stated = {
+        unit.name for text in fields if (unit := find_unit(text)) is not None and unit.kind in ("temperature", "length")
+    }
+    roles = [role_of_unit(unit) for unit in stated]
+    return {role: unit for role, unit in zip(roles, stated, strict=True) if roles.count(role) == 1}
 
 
 def _of_labview(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
@@ -395,7 +425,7 @@ def _of_campbell(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
 def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     """Return the layout of what EPICS' camonitor prints: channel, date, time, value, state of the alarm."""
     matching = [line for line, text, _ in head if MONITORED.match(text)]
-    if len(matching) < max(_ROWS_OF_VALUES, len(head) / 2):
+    if len(matching) < max(ROWS_OF_VALUES, len(head) / 2):
         return {}
     return {"header_rows": {"values": 1}, "long": {"time": ["2", "3"], "channel": "1", "value": "4"}}
 
@@ -403,7 +433,7 @@ def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
 def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     """Return where the names, the units and the values of any other table stand, nothing where the names are its first line."""
     rows = [(line, fields) for line, text, fields in head if not text.startswith("#")]
-    first = _first_of_values(rows)
+    first = first_of_values(rows)
     if first is None:
         raise LaserFormatError(
             f"{path}: no rows of numbers below one another; export it again with its readings, or move it out of the folder"
@@ -411,44 +441,39 @@ def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str
     width = len(rows[first][1])
     above = [(line, fields) for line, fields in rows[:first] if sum(map(bool, fields)) > width / 2]
     if not above:
-        if not _numbers_channels(rows[first : first + 1 + _ROWS_OF_VALUES]):
+        if not _numbers_channels(rows[first : first + 1 + ROWS_OF_VALUES]):
             return {"header_rows": {"values": rows[first][0]}}
         above, first = [rows[first]], first + 1
     header = {"names": above[-1][0], "values": rows[first][0]}
     given = [text for text in above[-1][1] if text]
     # Names may be blank above the second of two columns.
-    over = [line for line, fields in rows[:first] if line < above[-1][0] and sum(map(bool, fields)) > 1]
-    if over and sum(map(is_unit, given)) > len(given) / 2:
-        header |= {"names": over[-1], "units": above[-1][0]}
+    over = [(line, fields) for line, fields in rows[:first] if line < above[-1][0] and sum(map(bool, fields)) > 1]
+    if over and 2 * sum(map(is_unit, given)) >= len(given):
+        header |= {"names": over[-1][0], "units": above[-1][0]}
+    elif over and _is_over(over[-1][1], above[-1][1]):
+        header["units"] = over[-1][0]
     usual = {"names": rows[0][0], "values": rows[0][0] + 1}
     return {} if header == usual else {"header_rows": header}
 
 
-def _first_of_values(rows: Sequence[tuple[int, list[str]]]) -> int | None:
-    """Return the place of the first row of values, None where there is none."""
-    return next((k for k in range(len(rows)) if _begin_values(rows[k : k + _ROWS_OF_VALUES + _ROWS_BETWEEN])), None)
+def _is_over(groups: Sequence[str], names: Sequence[str]) -> bool:
+    """Whether a row of names of several columns each stands above another one, as a blank below it, or units that are only there, tell."""
+    if len(groups) != len(names) or all(groups):
+        return False
+    blank = any(group and not name for group, name in zip(groups, names, strict=True))
+    with_unit = any(is_unit(column_unit(text)) for text in groups) and not any(map(column_unit, names))
+    return blank or with_unit or any(_word(text)[1] in ROLES[1:3] for text in groups)
 
 
 def _numbers_channels(rows: Sequence[tuple[int, list[str]]]) -> bool:
     """Whether the first row holds names, with channels that are called by whole numbers, above rows of values."""
     (_, names), *values = rows
-    words = [k for k, name in enumerate(names) if name and not _VALUE.fullmatch(name)]
+    words = [k for k, name in enumerate(names) if name and not VALUE.fullmatch(name)]
     return (
-        bool(words)
+        bool(words and values)
         and all(name.isdecimal() for k, name in enumerate(names) if name and k not in words)
-        and all(len(fields) == len(names) and _VALUE.fullmatch(fields[words[0]].strip()) for _, fields in values)
+        and all(len(fields) == len(names) and VALUE.fullmatch(fields[words[0]].strip()) for _, fields in values)
     )
-
-
-def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
-    """Whether the first row and enough others as wide hold little but numbers and times, with a number in each."""
-    texts = [[text.strip() for text in fields if text.strip()] for _, fields in rows]
-    numeric = [sum(_VALUE.fullmatch(text) is not None or has_unit(text) for text in row) for row in texts]
-    values = [
-        count >= max(1, len(row) / 2) and len(fields) == len(rows[0][1])
-        for count, row, (_, fields) in zip(numeric, texts, rows, strict=True)
-    ]
-    return values[0] and sum(values) >= min(_ROWS_OF_VALUES, len(rows))
 
 
 def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str, Any]:
@@ -524,16 +549,39 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
                     keys["time_format"], asked["time_format"] = "%H:%M", "%M:%S"
                 return (name,)
             if _mostly([_is_read(text, DateOrder(order)) for text in written]):
+                behind = list(frame.columns)[list(frame.columns).index(columns[-1]) + 1 :][:1]
+                # Times of whole seconds repeat without it.
+                columns += [one for one in behind if is_fraction(one) and frame[one].nunique() > 1]
                 keys |= {"time": columns if len(columns) > 1 else name} | ({"date_order": order} if order else {})
                 return tuple(columns)
             asked.pop("date_order", None)
-    asked["every"] = ""
+    # Times that are not understood are named.
+    places = [(samples[name][0], name, frame[name].first_valid_index()) for name in named if name in texts][:1]
+    told = [f'{text!r} in the column "{name}", line {line}, is no time that is read' for text, name, line in places]
+    asked["every"] = "".join(told)
     return ()
+
+
+def _refuse_own_times(path: Path, rows: Rows, layout: LoggedTable, time: str) -> None:
+    """Refuse a table of which another column of times does not run as the first: its channels have a clock each."""
+    for name in filter(_OWN_TIME.match, map(str, rows.frame.columns)):
+        stated = (*_stated_units(rows, name), layout.time_unit, *_stated_units(rows, time))
+        own = layout.model_copy(update={"time_unit": next((unit for unit in stated if unit in TIME_UNITS), None)})
+        try:
+            first, other = read_times(path, rows, layout, [time])[0], read_times(path, rows, own, [name])[0]
+        except (FusionError, LaserFormatError):
+            continue
+        first, other = np.array([first, other])[:, ~(np.isnat(first) | np.isnat(other))].astype("i8")
+        if first.size > 1 and (np.diff(other) >= 0).all() and abs(np.ptp(other) - np.ptp(first)) > 0.01 * np.ptp(first):
+            raise LaserFormatError(
+                f'{path}: the times of the columns "{time}" and "{name}" do not run alike, so that channels have a clock each; write all '
+                "of them one below the other, in columns of time, channel and value"
+            )
 
 
 def _stated_units(rows: Rows, name: str) -> list[str]:
     """Return the units that the row of units and the heading state of a column."""
-    alone = name.strip() if unit_name(name.strip()) in DAY_NUMBERS else ""
+    alone = name.strip() if unit_name(name.strip()) in TIME_UNITS else ""
     return [unit_name(unit) for unit in (rows.units.get(name, ""), column_unit(name), alone) if unit.strip("- ")]
 
 
@@ -581,7 +629,7 @@ def _place_times(heading: str, numbers: np.ndarray, known: str, keys: dict[str, 
                     asked["start"] = " or ".join(other for _, other, *_ in _EPOCHS)
                 return
     if known:
-        keys |= {"time_unit": known} if known in DAY_NUMBERS else {}
+        keys |= {"time_unit": known} if known in DAY_NUMBERS or unit_name(heading.strip()) == known else {}
         return
     for unit, of_1970 in DAY_NUMBERS.items():
         if _DAYS_FROM < numbers[0] - of_1970 < _DAYS_TO and not (numbers == np.round(numbers)).all():
@@ -603,8 +651,10 @@ def _order_of(texts: Sequence[str], asked: dict[str, str]) -> str:
     with suppress(LaserFormatError):
         DateOrder.of(Path(), enumerate(texts))
         return ""
-    # A clock of AM and PM without blanks is an English one, as dates with the month first are.
+    # A clock of AM and PM without blanks is an English one, as dates with the month first are; years of two digits are the latest.
     usual = "month first" if re.search(r"\d ?[AP]M", " ".join(texts)) else "day first"
+    dates = next((found for text in texts if len(found := possible_dates(text)) > 1), {})
+    usual = "year first" if "year first" in dates and dates["year first"] == max(dates.values()) else usual
     first, *others = sorted(closest_orders(texts), key=usual.__ne__) or [""]
     asked |= {"date_order": " or ".join(others)} if others else {}
     return first
@@ -630,7 +680,9 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     suffixes = _SUFFIXES | _SUFFIXES_OF.get(_word(name)[1], {})
     behind = read_heading(name).unit
     share = behind.name if behind is not None and SHARE.search(name) else ""
-    ending = share or suffixes.get(re.split(r"[\s_/,;]+", name)[-1].casefold().replace("μ", "µ"), "")
+    ending = share or suffixes.get(
+        re.split(r"[\s_/,;]+", re.sub(r"\.\d+$", "", name))[-1].casefold().replace("μ", "µ"), ""
+    )
     told = "row of units" if unit.strip("- ") else "heading" if in_heading or ending else ""
     unit = unit_name(unit.strip("- ") or in_heading or ending)
     first = _first(series)
@@ -640,6 +692,10 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     known = Column(heading, "out", unit, first, low, high, told=told)
     warm = 12.0 < float(np.median(numbers)) < 80.0 and not (numbers == np.round(numbers)).all()
     word, role = _word(name)
+    if word in _COUNTING and unit in _OF_SPEED:
+        role = ""  # n in 1/min is a speed
+    if role == "spread" or _SPREAD.search(name):
+        return replace(known, remark=_OF_SPREAD)
     if role == "setpoint":
         # What is commanded acts as a load does; a commanded position does not.
         place = "displacement" in (role_of_unit(unit) if unit else "", _word(name.casefold().replace(word, ""))[1])
@@ -648,6 +704,10 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         return replace(known, role="driver", unit=unit or "1", remark="set point")
     if unit:
         of_unit = role_of_unit(unit)
+        if role in ("temperature", "displacement") and _RATE.fullmatch(unit) and not is_unit(unit):
+            return replace(known, remark="a rate")
+        if of_unit == "displacement" and (high - low) * column_conversion(unit, "mm")[0] > _FARTHEST_MM:
+            return replace(known, remark=f"moves farther than {_FARTHEST_MM:g} mm: no thermal displacement")
         if of_unit == "driver" and not is_unit(unit) and role != "driver":
             # A factor whose sense is not known stands beside the unit.
             of_rest = role_of_unit(_FACTOR.sub("", unit).strip())
@@ -659,7 +719,7 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         if unit == "deg" and kind and warm:
             # "Grad" and "°" alone may be degrees Celsius.
             return replace(known, role=role or "temperature", remark=UNIT_NOT_KNOWN)
-        if kind == "angle" or unit in ("um/m", "µm/m") or (kind == "time" and _grows(series)):
+        if kind in ("angle", "time") or unit in ("um/m", "µm/m"):
             return replace(known, remark="a time" if kind == "time" else "no load")
         if role == "displacement" and unit in _OF_SIGNALS:
             return replace(known, remark=UNIT_NOT_KNOWN)
@@ -667,7 +727,8 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
             return replace(known, role=role, remark=UNIT_NOT_KNOWN)
         if role == "temperature" and of_unit == "displacement" and (len(word) > 2 or unit in ("m", "in")):
             return replace(known, role=role, remark=UNIT_NOT_KNOWN)
-        taken = role == "out" or (role == "driver" and of_unit == "displacement")
+        # Of a logger "Last" is the last reading, and no load.
+        taken = role == "out" or (role == "driver" and of_unit == "displacement" and word != "last")
         return replace(known, role=role if taken and of_unit != "temperature" else of_unit)
     if role == "out":
         return known

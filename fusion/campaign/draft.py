@@ -538,11 +538,11 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
             break
     keys = dict(table.keys)
     for key, shown in table.asked.items():
-        if key in ("time_format", "date_order", "start"):
-            written = " ".join(column.first[0] for column in table.of("time"))
+        if key in ("time_format", "date_order", "start") or (key == "sheet" and asker.ask):
+            written = keys[key] if key == "sheet" else " ".join(column.first[0] for column in table.of("time"))
             choices = (keys[key], *(one for one in shown.split(" or ") if one not in ("", keys[key])))
             keys[key] = asker.choice(f"{known_keys()[f'record.{key}'].label}, such as {written}", choices)
-        elif key == "time_unit" and table.of("time")[0].remark and not asker.ask:
+        elif key == "sheet" or (key == "time_unit" and table.of("time")[0].remark and not asker.ask):
             keys[key] = TO_FILL
         elif key == "time_unit":
             units = (keys[key], *(unit for unit in ("s", "min", "h", "d") if unit != keys[key]))

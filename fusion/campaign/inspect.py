@@ -106,7 +106,7 @@ class Recognised:
     @cached_property
     def content(self) -> Any:
         """What the reader of its kind returns."""
-        if self.kind is Kind.RECORD and self.logged is not None:
+        if self.kind is Kind.RECORD and not isinstance(self.logged, str):
             return self.logged
         return self.kind.value.read(self.path)
 
@@ -164,16 +164,20 @@ class Recognised:
         return tuple(name.strip() for name in fields)
 
     @cached_property
-    def logged(self) -> TableProposal | None:
-        """Proposal for a table of something over time; None where the file is none, or one of readings, whatever it lacks."""
+    def of_a_laser(self) -> bool:
+        """Whether its first line names readings of a test, whatever stands beside them."""
         from interferometry.io.tables import read_heading
 
+        roles = {read_heading(name).role for name in self.first_line}
+        return len(roles & {"cycle", "direction", "target", "position", "measured", "deviation"}) > 1
+
+    @cached_property
+    def logged(self) -> TableProposal | str:
+        """Proposal for a table of something over time; why the file is none, or "" where it is one of readings, whatever it lacks."""
         try:
-            roles = {read_heading(name).role for name in self.first_line}
-            of_a_laser = len(roles & {"cycle", "direction", "target", "position", "measured", "deviation"}) > 1
-            return None if of_a_laser else resolve_name("fusion.campaign.columns:propose_table")(self.path)
-        except (FusionError, InterferometryError):
-            return None
+            return "" if self.of_a_laser else resolve_name("fusion.campaign.columns:propose_table")(self.path)
+        except (FusionError, InterferometryError) as error:
+            return str(error)
 
 
 def _is_recipe(found: Recognised) -> bool:
@@ -245,6 +249,8 @@ def _lists_sensors(found: Recognised) -> bool:
 
 
 def _names_a_record(found: Recognised) -> bool:
+    if found.of_a_laser:
+        return False
     units = {column_unit(name) for name in found.first_line}
     return any(map(is_time, found.first_line)) and all(units & of_role for of_role in _OF_A_RECORD)
 
@@ -347,13 +353,12 @@ def _describe_record(found: Recognised) -> list[str]:
     table = found.content
     sheet = f"sheet {table.keys['sheet']!r}, " if "sheet" in table.keys else ""
     held = join([column.heading for column in table.of("time")])
-    time = (
-        f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else "without times"
-    )
+    without = "times not understood" if table.asked.get("every") else "without times"
+    time = f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else without
     doubts = [f"{key} = {table.keys[key]}" for key in table.asked if key in table.keys]
     if "time_unit" in table.asked:
         doubts = [f"times {table.asked['time_unit']}, in {table.keys['time_unit']}?"]
-    lacks = [f"warning: {fault}" for fault in (table.lacks, table.refused) if fault]
+    lacks = [f"warning: {fault}" for fault in (table.lacks, table.asked.get("every"), table.refused) if fault]
     return [
         f"record, {sheet}{counted(table.rows, 'row')}, {time}",
         *(f"{doubt}, which nothing states" for doubt in doubts),
@@ -484,7 +489,7 @@ class Kind(Enum):
     RECORD = FileKind(
         "record of temperatures and displacements", _names_a_record, _later("fusion.campaign.columns:propose_table"), _describe_record,
         "record.file",
-        may_be=lambda found: found.logged is not None and found.logged.may_be_record,
+        may_be=lambda found: not isinstance(found.logged, str) and found.logged.may_be_record,
         unused="; the runs of one record have the same columns, another record is a campaign of its own",
     )  # fmt: skip
     DRIVERS = FileKind("log of drivers", _logs_drivers, lambda path: fusion.read_drivers(path), _describe_log, "drivers.file")  # fmt: skip
@@ -533,9 +538,10 @@ def _kind_of(found: Recognised) -> Kind:
     except InterferometryError as error:
         if (kind := next((one for one in Kind if one.value.may_be(found)), None)) is not None:
             return kind
-        _, reason = _why_not(path, error)
-        shortened = reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ..."
-        raise FusionError(shortened if found.logged is None else found.logged.lacks) from error
+        if not isinstance(found.logged, str):
+            raise FusionError(found.logged.lacks) from error
+        _, reason = _why_not(path, FusionError(found.logged) if found.logged else error)
+        raise FusionError(reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ...") from error
 
 
 # What a folder holds for a campaign: frames by pattern, readings, logs, the plan, and what is not understood.

@@ -9,9 +9,9 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate, chain, count
 from pathlib import Path
 from typing import Any
@@ -46,9 +46,10 @@ from interferometry.io.faults import (
     LaserFormatError,
     Numerals,
     RejectedLine,
+    parts_thousands,
     raise_if_mostly_invalid,
 )
-from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
+from interferometry.io.spreadsheets import Cell, cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
     DELIMITERS,
     NO_ZONE,
@@ -88,6 +89,11 @@ _LONGEST_RECORD_S = 4.5e9
 _LONGEST_SILENCE = 10.0
 #: A zone by its place, in a heading.
 _PLACE = re.compile(r"[A-Z][a-z]+/[A-Z][\w+-]+(?:/[A-Z]\w+)?")
+#: A line above a table that states the zone of its times.
+_OF_ZONE = re.compile(r"zone|zona|fuseau|(utc|gmt).?offset", re.IGNORECASE)
+_OFFSET = re.compile(r"(?<!\d)([+-]\d\d):?(\d\d)")
+#: Heading of the milliseconds beside a time.
+_MILLISECONDS = re.compile(r"ms(ec)?|milliseconds?|sub ?sec", re.IGNORECASE)
 #: Names of columns that hold a part of a time each -> the part.
 PARTS = by_word(vocabulary("columns")["parts"])
 #: Counters of loggers, in bits, and the largest step over which they are seen to begin again, in usual steps.
@@ -105,6 +111,13 @@ _HALF = r"\d+:\d\d\S*(?: [AaPp]\.?[Mm]\.?)?|\S+"
 _VALUES = (_WORDS, re.compile(_HALF), re.compile(rf"(?:\d+[-/.]\d+[-/.]\d+ )?{_HALF}"))
 #: Lines with nothing but a rule.
 _RULED = re.compile(r"[\s=_+-]*")
+#: Lines in which the values of a table have begun.
+HEAD = 200
+#: Rows of values, one below the other, that are no accident.
+ROWS_OF_VALUES = 3
+#: Rows that may stand between them: an empty one, a remark, a header that is repeated.
+_ROWS_BETWEEN = 2
+VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
 #: Lines of values by which the columns of a text are found.
 _SAMPLE = 200
 #: Channel, date, time and value as EPICS' camonitor prints them.
@@ -233,19 +246,20 @@ def _laid_out(path: Path, layout: LoggedTable) -> DelimitedTable:
     lines = [
         (int(line), [stamp, *fields]) for line, stamp, fields in zip(rows.frame.index, written, texts, strict=True)
     ]
-    return DelimitedTable(path, ("time", *headings), lines, Numerals.of(text for fields in texts for text in fields))
+    return DelimitedTable(path, ("time", *headings), lines, Numerals.of_columns(zip(*texts, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """A logged table as text and numbers, by lines of its file; its units by heading, lines that do not fit or sum the others up, and by
-    heading cells that are no readings.
+    """A logged table as text and numbers, by lines of its file; its units by heading, lines that do not fit or sum the others up, by
+    heading cells that are no readings, and the lines above its names.
     """
 
     frame: pd.DataFrame
     units: Mapping[str, str]
     left_out: list[RejectedLine]
     marks: Mapping[str, list[RejectedLine]] = field(default_factory=dict)
+    above: Sequence[str] = ()
 
 
 def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
@@ -397,28 +411,68 @@ def read_rows(
         workbook = is_workbook(file.read(8))
     try:
         rows = None if workbook else _read_text(path, header)
+    except LaserFormatError:
+        raise
     except (ValueError, OSError, pd.errors.ParserError) as error:
         raise TableError(f"{path}: cannot be read as a table: {error}; save it as CSV in UTF-8 or as XLSX") from None
-    return _without_marks(
-        path, rows or _read_sheet(path, sheet, header), [mark for mark in missing if not isinstance(mark, str)]
-    )
+    rows = _numbers_of_cells(path, rows or _read_sheet(path, sheet, header))
+    return _without_marks(path, rows, [mark for mark in missing if not isinstance(mark, str)])
 
 
 def _read_sheet(path: Path, sheet: str | None, header: HeaderRows | None) -> Rows:
-    """Read one sheet of a spreadsheet, the first without a name, with the types that pandas gives the columns."""
-    sheets = read_cells(path, as_stored=True)
-    name = sheet or next(iter(sheets))
-    if name not in sheets:
-        raise TableError(f"{path}: there is no sheet {name!r}; the sheets are {', '.join(map(repr, sheets))}")
-    first = sheets[name][0][0]
+    """Read one sheet of a spreadsheet with the types that pandas gives the columns."""
+    _, rows, _ = sheet_of(path, sheet)
+    first = rows[0][0]
     header = header or HeaderRows(names=first, values=first + 1)
-    by_line = {line: [cell_text(cell) for cell in cells] for line, cells in sheets[name] if line < header.values}
-    below = [(line, cells) for line, cells in sheets[name] if line >= header.values]
-    names = by_line.get(header.names or 0) or [str(k + 1) for k in range(len(sheets[name][0][1]))]
+    by_line = {line: [cell_text(cell) for cell in cells] for line, cells in rows if line < header.values}
+    below = [(line, cells) for line, cells in rows if line >= header.values]
+    names = by_line.get(header.names or 0) or [str(k + 1) for k in range(len(rows[0][1]))]
     frame = TextParser([names, *(cells for _, cells in below)]).read()
     # Lines are counted in the file.
     frame.index = pd.Index([line for line, _ in below])
-    return _named(frame, by_line.get(header.units or 0, []), [])
+    above = [" ".join(filter(None, cells)) for line, cells in by_line.items() if line < (header.names or 0)]
+    return _named(frame, header, by_line.get(header.units or 0, []), [], above)
+
+
+def sheet_of(path: Path, name: str | None = None) -> tuple[str, list[tuple[int, list[Cell]]], list[str]]:
+    """Return name and rows of a sheet, and the other sheets with its headings; no name where none is needed.
+
+    Without a name it is the first with rows of values, beside which those of the same times stand.
+    """
+    sheets = read_cells(path, as_stored=True)
+    if name is not None and name not in sheets:
+        raise TableError(f"{path}: there is no sheet {name!r}; the sheets are {', '.join(map(repr, sheets))}")
+    heads = {
+        one: [(line, [cell_text(cell) for cell in cells]) for line, cells in rows[:HEAD]]
+        for one, rows in sheets.items()
+    }
+    firsts = {
+        one: at for one, rows in heads.items() if (at := first_of_values(rows)) is not None and len(rows) > at + 1
+    }
+    used = name or next(iter(firsts or sheets))
+    rows, times = sheets[used], [cells[0] for _, cells in sheets[used]]
+    others = [] if name else [one for one in firsts if one != used]
+    alike = [one for one in others if heads[one][: firsts[one]] == heads[used][: firsts[used]]]
+    beside = [one for one in others if one not in alike and [cells[0] for _, cells in sheets[one]] == times]
+    for one in beside:
+        rows = [(line, [*cells, *more[1:]]) for (line, cells), (_, more) in zip(rows, sheets[one], strict=True)]
+    return ("" if beside or (used == next(iter(sheets)) and not alike) else used), rows, alike
+
+
+def first_of_values(rows: Sequence[tuple[int, list[str]]]) -> int | None:
+    """Return the place of the first row of values, None where there is none."""
+    return next((k for k in range(len(rows)) if _begin_values(rows[k : k + ROWS_OF_VALUES + _ROWS_BETWEEN])), None)
+
+
+def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
+    """Whether the first row and enough others as wide hold little but numbers and times, with a number in each."""
+    texts = [[text.strip() for text in fields if text.strip()] for _, fields in rows]
+    numeric = [sum(VALUE.fullmatch(text) is not None or has_unit(text) for text in row) for row in texts]
+    values = [
+        count >= max(1, len(row) / 2) and len(fields) == len(rows[0][1])
+        for count, row, (_, fields) in zip(numeric, texts, rows, strict=True)
+    ]
+    return values[0] and sum(values) >= min(ROWS_OF_VALUES, len(rows))
 
 
 def text_lines(path: Path, header: HeaderRows | None = None) -> list[str]:
@@ -541,9 +595,6 @@ def _read_text(path: Path, header: HeaderRows | None) -> Rows:
     skipped = {
         int(line) - 2: (due, saw) for warning in caught for line, due, saw in _SKIPPED.findall(str(warning.message))
     }
-    for name, column in frame.items():
-        if not pd.api.types.is_numeric_dtype(column):
-            frame[name] = _ungrouped(column, decimal)
     # Lines are counted in the file; a quoted field may go over several of them.
     quoted = np.cumsum([0, *(line.count('"') for line in below)])[:-1] % 2 == 1
     for begins in (np.full(len(below), True), ~quoted):
@@ -555,30 +606,49 @@ def _read_text(path: Path, header: HeaderRows | None) -> Rows:
     else:
         raise FusionError("quotation marks that open and do not close; remove them")
     frame.index = pd.Index(np.array(held, int) + header.values)
+    for name, column in frame.items():
+        if not pd.api.types.is_numeric_dtype(column):
+            frame[name] = _ungrouped(path, column, decimal)
     left_out = [
         RejectedLine(path.name, int(numbers[k]) + header.values, f"{saw} fields", f"{due} were expected")
         for k, (due, saw) in skipped.items()
     ]
-    return _named(frame, fields_of(lines[header.units - 1], delimiter) if header.units else [], left_out)
+    units = fields_of(lines[header.units - 1], delimiter) if header.units else []
+    return _named(frame, header, units, left_out, lines[: (header.names or 1) - 1])
 
 
-def _ungrouped(column: pd.Series, decimal: str) -> pd.Series:
-    """Return the whole numbers of a column without marks between thousands, as other columns or its numbers below 1000 tell them."""
+def _ungrouped(path: Path, column: pd.Series, decimal: str) -> pd.Series:
+    """Return the whole numbers of a column without marks between thousands, where it shows that its marks are these."""
     texts = stripped(column)
-    grouped = next(filter(THOUSANDS.fullmatch, texts), "")
-    mark = "." if "." in grouped else ","
-    of_thousands = decimal not in ("", mark) if decimal else any(map(str.isdecimal, texts))
-    if not grouped or not of_thousands or Numerals.of(texts) != Numerals():
+    grouped = texts[texts.map(THOUSANDS.fullmatch).notna()]
+    mark = "." if "." in "".join(grouped[:1]) else ","
+    if grouped.empty or mark == decimal or Numerals.of(texts).examples:
         return column
-    return texts.where(texts.map(THOUSANDS.fullmatch).isna(), texts.str.replace(mark, "")).mask(column.isna())
+    if parts_thousands(texts):
+        return texts.where(texts.map(THOUSANDS.fullmatch).isna(), texts.str.replace(mark, "")).mask(column.isna())
+    if decimal and len(grouped) > len(column) / 2:
+        raise LaserFormatError(
+            f'{path}, line {grouped.index[0]}: {grouped.iloc[0]!r} in the column "{column.name}" may part thousands or decimals, as '
+            f"{decimal!r} is the decimal mark elsewhere; write this column without marks between thousands, or all with one decimal mark"
+        )
+    return column
 
 
-def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) -> Rows:
+def _named(
+    frame: pd.DataFrame, header: HeaderRows, units: list[str], left_out: list[RejectedLine], above: Sequence[str]
+) -> Rows:
     """Return rows with the names of their columns, and their units, without the spaces around them."""
     names: dict[str, None] = {}
+    grouped = (header.units or 0) < (header.names or 0) and 2 * sum(map(is_unit, units)) < sum(map(bool, units))
+    over = [text.strip() for text in units] if grouped else []
     for k, name in enumerate(frame.columns):
-        plain = str(name).strip()
-        if plain == f"Unnamed: {k}" and names and (unit := "".join(units[k : k + 1]).strip()):
+        plain, unnamed = str(name).strip(), f"Unnamed: {k}"
+        if over[k : k + 1]:
+            # A name over several columns, as of merged cells: its unit is that of each.
+            over[k] = over[k] or (over[k - 1] if k and plain != unnamed else "")
+            group, unit = name_and_unit(over[k])
+            plain = over[k] if plain == unnamed else f"{group} {plain}{f' [{unit}]' if unit else ''}".strip()
+        elif plain == unnamed and names and (unit := "".join(units[k : k + 1]).strip()):
             # A name above two columns: the second is told by its unit.
             plain = f"{name_and_unit(next(reversed(names)))[0]} [{unit}]"
         # As pandas numbers headings that are alike.
@@ -588,57 +658,88 @@ def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) 
         # 20260309063000 is no number.
         if frame[number].between(19e12, 22e12).all():
             frame[str(number)] = frame[number].map("{:.0f}".format).str.replace(r"^(\d{8})", r"\1T", regex=True)
-    return Rows(
-        frame, {str(name): unit.strip("[]() ") for name, unit in zip(frame.columns, units, strict=False)}, left_out
-    )
+    of_names = {} if over else dict(zip(frame.columns, units, strict=False))
+    return Rows(frame, {str(name): unit.strip("[]() ") for name, unit in of_names.items()}, left_out, above=above)
+
+
+def _numbers_of_cells(path: Path, rows: Rows) -> Rows:
+    """Return rows whose numbers stand without the unit beside them in their cells; refuse a column that is stated to be in two units."""
+    frame, in_cells, before = rows.frame, dict[str, str](), ""
+    for name in map(str, frame.columns):
+        left, before = before, name
+        if pd.api.types.is_numeric_dtype(frame[name]):
+            continue
+        texts = stripped(frame[name])
+        if left and texts.nunique() == 1 and find_unit(texts.iloc[0]) and not name_and_unit(left)[1]:
+            in_cells[left] = texts.iloc[0]  # a column of values, and one of their unit
+        sample = texts[texts != ""].iloc[:_SAMPLE]
+        if 2 * sum(map(has_unit, sample)) > len(sample):
+            frame[name], in_cells[name] = _unit_in_cells(path, name, texts)
+    for name in frame.columns:
+        stated = {
+            "heading": name_and_unit(name)[1],
+            "row of units": rows.units.get(name, ""),
+            "cells": in_cells.get(name, ""),
+        }
+        known = {unit: place for place, text in stated.items() if (unit := find_unit(text)) is not None}
+        if len(known) > 1:
+            both = " and in ".join(f"{unit.name} by its {place}" for unit, place in known.items())
+            raise TableError(f'{path}: the column "{name}" is in {both}; correct one of them')
+    return replace(rows, units={**rows.units, **in_cells})
 
 
 def _without_marks(path: Path, rows: Rows, missing: Sequence[float]) -> Rows:
-    """Return rows without lines that sum the others up and marks for no reading, both named, and numbers without the unit beside them in
-    their cells; refuse another header whose columns or units differ.
-    """
-    frame, units = rows.frame, dict(rows.units)
-    summaries, marks = dict[int, str](), dict[str, list[RejectedLine]]()
-    of_units, anew = Counter[int](), dict[int, tuple[str, str, str]]()
+    """Return rows without lines that sum the others up and marks for no reading, both named."""
+    frame, odd, summaries = rows.frame, dict[str, dict[int, str]](), dict[int, str]()
     for name in map(str, frame.columns):
-        texts = stripped(frame[name]) if not pd.api.types.is_numeric_dtype(frame[name]) else None
-        if texts is not None:
-            filled = texts[texts != ""]
-            sample = filled.iloc[:_SAMPLE]
-            if 2 * sum(map(has_unit, sample)) > len(sample):
-                frame[name], units[name] = _unit_in_cells(path, name, texts)
-            elif 2 * np.isfinite(numbers_in(sample)).sum() <= len(sample):
-                named = filled[filled.map(_SUMMARY.fullmatch).notna()]
-                few = len(named) <= min(_MOST_SUMMARIES, len(frame) / 10)
-                summaries.update(zip(named.index, named, strict=True) if few else ())
+        cells, numbers = frame[name], numbers_in(frame[name])
+        is_odd = np.isin(numbers, missing) | (np.abs(numbers) >= SENTINEL_MAGNITUDE)
+        if not pd.api.types.is_numeric_dtype(cells):
+            texts = stripped(cells)
+            if 2 * np.isfinite(numbers).sum() <= (texts != "").sum():
+                named = texts[texts.map(_SUMMARY.fullmatch).notna()]
+                summaries |= dict(named) if len(named) <= min(_MOST_SUMMARIES, len(frame) / 10) else {}
                 continue
-        numbers = numbers_in(frame[name])
+            is_odd |= np.isnan(numbers) & (texts != "").to_numpy()
+        if is_odd.any():
+            odd[name] = {
+                line: str(cell).strip() for line, cell in zip(cells.index[is_odd].tolist(), cells[is_odd], strict=True)
+            }
+            frame[name] = cells.mask(is_odd & np.isfinite(numbers))
+    _refuse_another_header(path, odd, rows.units, headings=frame.columns)
+    summaries |= {line: text for cells in odd.values() for line, text in cells.items() if _SUMMARY.search(text)}
+    marks = {
+        name: [
+            RejectedLine(path.name, line, text, f"is no reading of {name}")
+            for line, text in cells.items()
+            if not _SUMMARY.search(text)
+        ]
+        for name, cells in odd.items()
+    }
+    left_out = [RejectedLine(path.name, line, text, "sums up other lines") for line, text in sorted(summaries.items())]
+    return replace(rows, frame=frame.drop(index=list(summaries)), left_out=[*rows.left_out, *left_out], marks=marks)
+
+
+def _refuse_another_header(
+    path: Path, odd: Mapping[str, Mapping[int, str]], units: Mapping[str, str], *, headings: Collection[str]
+) -> None:
+    """Refuse a line among the values whose cells head their columns anew, by other names or units."""
+    of_units, anew = Counter[int](), dict[int, tuple[str, str, str]]()
+    for name, cells in odd.items():
         known = units.get(name, "").strip("- ") or name_and_unit(name)[1]
-        odd = np.isin(numbers, missing) | (np.abs(numbers) >= SENTINEL_MAGNITUDE)
-        if texts is not None:
-            odd |= np.isnan(numbers) & (texts != "").to_numpy()
-        for line, cell in frame[name][odd].items():
-            text = str(cell).strip()
+        for line, text in cells.items():
             unit = name_and_unit(text)[1]
-            heads = (is_unit(unit) and unit != unit_name(known)) or (text != name and text in frame.columns)
+            heads = (is_unit(unit) and unit != unit_name(known)) or (text != name and text in headings)
             # A unit alone may be a state; a row of them heads what is below it.
             of_units[line] += 2 if heads else is_unit(text) and text not in ("-", "1")
             if heads or (known and is_unit(text) and unit_name(text) != unit_name(known)):
                 anew[line] = text, name, known
-            if _SUMMARY.search(text):
-                summaries[line] = text
-            else:
-                marks.setdefault(name, []).append(RejectedLine(path.name, line, text, f"is no reading of {name}"))
-        if odd.any():
-            frame[name] = frame[name].mask(odd & np.isfinite(numbers))
-    line, (text, name, known) = next(((line, of) for line, of in anew.items() if of_units[line] > 1), (0, ("", "", "")))
-    if line:
-        raise TableError(
-            f'{path}, line {line}: {text!r} heads the column "{name}"{f", in {known} so far," if known else ""} anew; give what was logged '
-            "before and after this line in files of its own"
-        )
-    left_out = [RejectedLine(path.name, line, text, "sums up other lines") for line, text in sorted(summaries.items())]
-    return Rows(frame.drop(index=list(summaries)), units, [*rows.left_out, *left_out], marks)
+    for line, (text, name, known) in anew.items():
+        if of_units[line] > 1:
+            raise TableError(
+                f'{path}, line {line}: {text!r} heads the column "{name}"{f", in {known} so far," if known else ""} anew; give what was '
+                "logged before and after this line in files of its own"
+            )
 
 
 def _unit_in_cells(path: Path, name: str, texts: pd.Series) -> tuple[pd.Series, str]:
@@ -749,8 +850,15 @@ def written_times(frame: pd.DataFrame, headings: Sequence[str]) -> pd.Series:
     if len(headings) == 1:
         return frame[headings[0]]
     parts = frame[list(headings)]
+    if is_fraction(headings[-1]):
+        parts = parts.assign(**{headings[-1]: [f".{number:03.0f}" for number in numbers_in(parts[headings[-1]])]})
     joined = pd.Series([" ".join(map(str, row)) for row in parts.itertuples(index=False)], frame.index, dtype=object)
-    return joined.where(parts.notna().all(axis=1))
+    return joined.str.replace(" .", ".", regex=False).where(frame[list(headings)].notna().all(axis=1))
+
+
+def is_fraction(heading: str) -> bool:
+    """Whether a heading is that of the milliseconds of a time beside it."""
+    return _MILLISECONDS.fullmatch(heading.strip()) is not None
 
 
 def read_times(
@@ -782,8 +890,9 @@ def read_times(
                 time[at], zone = parse_time(text, order)
                 zones.setdefault(zone, line)
         words = describe_time_zone(path, zones) if zones else ""
-    if words == NO_ZONE and (zone := _zone_in(" ".join(headings))):
-        time, words = from_zone(time, zone, file=path.name), f"converted to UTC from {zone}, as the heading says"
+    for said in (" ".join(headings), *filter(_OF_ZONE.search, rows.above)):
+        if words == NO_ZONE and (zone := _zone_in(said)):
+            time, words = from_zone(time, zone, file=path.name), f"converted to UTC from {zone}, as the heading says"
     same = np.flatnonzero(np.diff(time) == np.timedelta64(0)) + 1
     # What alone repeats a time, at the end, sums up the rows above it.
     same = (
@@ -804,9 +913,12 @@ def read_times(
 
 
 def _zone_in(heading: str) -> str:
-    """Return the zone that a heading states, as UTC+02:00 or by its place; empty where it states none."""
+    """Return the zone that a heading or a line above it states, as UTC+02:00 or by its place; empty where it states none."""
     place = next((name for name in _PLACE.findall(heading) if name in available_timezones()), "")
-    return f"UTC{zone[:3]}:{zone[3:]}" if (zone := zone_of(heading)) else place
+    if _OF_ZONE.search(heading) and (bare := _OFFSET.search(heading)):
+        return f"UTC{bare[1]}:{bare[2]}"
+    zone = "" if "offset" in heading.lower() else zone_of(heading)
+    return f"UTC{zone[:3]}:{zone[3:]}" if zone else place
 
 
 def parts_of_time(frame: pd.DataFrame, headings: Sequence[str]) -> pd.Series | None:

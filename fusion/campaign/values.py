@@ -42,8 +42,13 @@ _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?
 _CYCLES = re.compile(r"\s*(\d{1,99})(?:\s*-\s*(\d{1,99}))?\s*")
 #: Heading of a column with its unit, ``"name [unit]"`` or ``"name(unit)"``, and as HOBOware has it, ``"name, unit"``.
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
+#: The same with the unit before the name, or within it.
+_WITHIN = re.compile(r"[\[(]([^\[\]()]+)[\])](?!\.\d+$)")
 #: The same as ISO 80000 writes it, ``"T1 / °C"``; without spaces of a time alone, as m/s is a unit.
-_QUOTIENT = re.compile(r"\s*(?:(.+?)(?:\s+/\s+|,\s*)|(t|time|zeit)/)(\S.*?)\s*", re.IGNORECASE)
+_QUOTIENT = re.compile(
+    r"\s*(?:(.+?)(?:\s+/\s+|,\s*|\s+in\s+)|(t|time|zeit)/|(time|zeit|timestamp|elapsed)_(?=m?s|min|h))(\S.*?)\s*",
+    re.IGNORECASE,
+)
 #: A number and the unit beside it.
 BESIDE = re.compile(r"([-+−]?[\d.,]*\d(?:[eE][-+]?\d+)?)\s*([^\s\d].*)")
 #: Numbers of logger and sensor that HOBOware writes behind a heading.
@@ -72,11 +77,26 @@ def name_and_unit(heading: str) -> tuple[str, str]:
     """
     text = _SERIAL.sub("", heading).strip()
     name, unit = text, ""
+    over, _, below = text.rpartition("/")
     if match := _HEADING.fullmatch(text):
         name, unit = match[1], unit_name(match[2])
-    elif (match := _QUOTIENT.fullmatch(text)) and is_unit(match[3]):
-        name, unit = match[1] or match[2], unit_name(match[3])
-    if find_unit(unit) is None and has_unit(unit):
+    elif (match := _QUOTIENT.fullmatch(text)) and is_unit(match[4]):
+        name, unit = match[1] or match[2] or match[3], unit_name(match[4])
+    elif (
+        over
+        and (whole := find_unit(below))
+        and whole.kind in ("temperature", "length")
+        and not (is_unit(over) or is_unit(text))
+    ):
+        name, unit = over, whole.name
+    elif (match := _WITHIN.search(text)) and find_unit(match[1]):
+        name, unit = f"{text[: match.start()]}{text[match.end() :]}".strip(), unit_name(match[1])
+    if (
+        find_unit(unit) is None
+        and (beside := BESIDE.fullmatch(unit))
+        and (whole := find_unit(beside[2]))
+        and whole.kind != "time"
+    ):
         return text, ""  # Z (100 mm): where it is
     if (times := _TIMES.search(name)) and times[0] != name:
         return name.replace(times[0], ""), f"{(times[1] or times[2]).strip()} {unit}".strip()

@@ -93,7 +93,7 @@ def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine],
 SENTINEL_MAGNITUDE = 1e19
 #: Minus signs of word processors and tables, and spaces that part thousands.
 _SIGNS = str.maketrans({"\u2212": "-", "\u2013": "-", "\uff0d": "-", "\ufe63": "-", "\uff0b": "+"})
-_SPACES = re.compile(r"[\s\u00a0\u2007\u2009\u202f']")
+_SPACES = re.compile(r"[\s\u00a0\u2007\u2009\u202f'\u2019]")
 _NUMBER = re.compile(r"[+-]?(\d+[\d.,]*|[.,]\d+)([eE][+-]?\d+)?")
 #: What most files write, and what has one meaning where the decimal separator is a point.
 _PLAIN = re.compile(r"[+-]?\d+(\.\d+)?")
@@ -122,7 +122,7 @@ def parse_number(text: str) -> float:
 class Numerals:
     """How the numbers of one file are written: the decimal separator, "" where a single separator is the decimal one.
 
-    ``examples`` are a number of each kind where the file has both.
+    ``examples`` are the numbers that tell it, one of each kind.
     """
 
     decimal: str = ""
@@ -137,7 +137,20 @@ class Numerals:
             match = _DECIMAL.fullmatch(cleaned) if _NUMBER.fullmatch(cleaned) else None
             if match and match["decimal"] != match["group"] and not THOUSANDS.fullmatch(cleaned):
                 seen.setdefault(match["decimal"], text.strip())
-        return cls(next(iter(seen))) if len(seen) == 1 else cls(examples=tuple(seen.values()))
+        return cls(next(iter(seen)) if len(seen) == 1 else "", tuple(seen.values()))
+
+    @classmethod
+    def of_columns(cls, columns: Iterable[Iterable[str]]) -> Numerals:
+        """Find it from the columns of a file: where another separator is the decimal one elsewhere, a column shows that its own parts
+        thousands by a number below 1000, or one with both.
+        """
+        listed = [dict.fromkeys(column) for column in columns]
+        whole = cls.of(text for column in listed for text in column)
+        for column in listed if whole.decimal else ():
+            open_ = next((text for text in column if THOUSANDS.fullmatch(text) and whole.decimal not in text), "")
+            if open_ and not parts_thousands(column):
+                return cls(examples=(*whole.examples, open_))
+        return whole
 
     def number(self, text: str) -> float:
         """Return a finite number."""
@@ -146,7 +159,7 @@ class Numerals:
         cleaned = _SPACES.sub("", text.strip().translate(_SIGNS))
         if not _NUMBER.fullmatch(cleaned):
             return parse_number(text)
-        if self.examples and THOUSANDS.fullmatch(cleaned):
+        if not self.decimal and self.examples and THOUSANDS.fullmatch(cleaned):
             both = " and ".join(map(repr, self.examples))
             raise BadReading(
                 text, f"may part thousands or decimals, as the file has {both}; write one decimal separator"
@@ -161,6 +174,15 @@ class Numerals:
         if text.count("9") >= 4 and _ALL_NINES.fullmatch(_SPACES.sub("", text.strip().translate(_SIGNS))):
             raise BadReading(text, "consists of nines only, a mark for no reading")
         return self.number(text)
+
+
+def parts_thousands(texts: Iterable[str]) -> bool:
+    """Return whether numbers of which some may part thousands show it: by a whole one below 1000, or one with two separators."""
+    return any(
+        (text.isdecimal() and len(text) < 4) or len(re.split("[.,]", text)) > 2
+        for text in texts
+        if _NUMBER.fullmatch(text)
+    )
 
 
 def _groups(cleaned: str, separator: str) -> bool:

@@ -141,27 +141,6 @@ def check_and_assemble(given: Readings) -> xr.Dataset:
     return deviations
 
 
-def turn_by_travel(given: Readings) -> None:
-    """Exchange the directions where "forward" runs led to smaller positions; without times they are taken as positive."""
-    passes: dict[tuple[int, str], list[Reading]] = defaultdict(list)
-    for reading in given.readings:
-        passes[reading.cycle, reading.direction].append(reading)
-    votes = 0
-    for (_, direction), group in passes.items():
-        if len(group) < 2 or any(np.isnat(reading.time) for reading in group):
-            continue
-        group.sort(key=lambda reading: reading.time)
-        travel = group[-1].position - group[0].position
-        votes += int(np.sign(travel)) * (1 if direction == DIRECTIONS[0] else -1)
-    if votes < 0:
-        other = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
-        given.readings = [replace(reading, direction=other[reading.direction]) for reading in given.readings]
-        given.unreadable = {(cycle, other[direction], target) for cycle, direction, target in given.unreadable}
-        given.notes.append("the forward runs lead to smaller positions: they are the negative direction")
-    elif votes == 0:
-        given.notes.append("forward was taken as the positive direction: the file gives no times that tell the travel")
-
-
 @dataclass(frozen=True)
 class Stated:
     """What a campaign file, or a caller, states of a table that does not say it itself: directions of its runs, names of units."""
@@ -234,9 +213,6 @@ def passes_by_order(positions: Sequence[float], runs: Sequence[int]) -> list[tup
         for number, (rows, sign) in enumerate(zip(passes, signs, strict=True), start=1)
         for _ in rows
     ]
-
-
-_BY_ORDER = "the direction of each run follows from the order of its positions"
 
 
 def number_targets(positions: Sequence[float]) -> list[int]:
@@ -591,8 +567,6 @@ def _read_labels(table: _Labelled, stated: Stated) -> Readings:
             deviation = round(reading * FINE[given.kind], 6)
             given.readings.append(Reading(label.line, *cell, label.position, time, deviation))
     given.left_out.lines.sort(key=lambda each: each.line)
-    if not all(label.signed for label in labels):
-        turn_by_travel(given)
     _compare_signs(given, np.array(measured) * FINE[given.kind])
     return given
 
@@ -633,7 +607,7 @@ def _with_directions(
     if named and not (table.in_order and _contradicts(labels)):
         if directions is not None:
             raise LaserFormatError(f"{table.place}: the table names the direction of its runs; remove directions")
-        return labels
+        return _turned(table, labels)
     positions = [label.position for label in labels]
     passes = None if named else passes_by_order(positions, [number for number, _ in runs])
     if passes is not None:
@@ -654,15 +628,33 @@ def _with_directions(
     return [replace(label, direction=of_run[run]) for label, run in zip(labels, runs, strict=True)]
 
 
-def _contradicts(labels: Sequence[_Label]) -> bool:
-    """Whether every run goes against the sign of the direction that it is given, in the order of the lines."""
+def _ways(labels: Sequence[_Label], *, signed: bool) -> list[int]:
+    """Return for every run whose direction has a sign, or has none, whether it goes with (1) or against it, in the order of the lines."""
     runs = [[*run] for _, run in itertools.groupby(labels, lambda one: (one.number, one.direction))]
-    ways = [
-        (run[-1].position - run[0].position) * (1 if run[0].direction == DIRECTIONS[0] else -1)
+    return [
+        int(np.sign(run[-1].position - run[0].position)) * (1 if run[0].direction == DIRECTIONS[0] else -1)
         for run in runs
-        if run[0].signed and len(run) > 1
+        if run[0].signed == signed and len(run) > 1
     ]
-    return bool(ways) and max(ways) < 0
+
+
+def _contradicts(labels: Sequence[_Label]) -> bool:
+    """Whether every run goes against the sign of the direction that it is given."""
+    return max(_ways(labels, signed=True), default=0) < 0
+
+
+def _turned(table: _Labelled, labels: list[_Label]) -> list[_Label]:
+    """Return labels whose "forward" is the positive direction, or where the times show that it leads to smaller positions the negative."""
+    if all(label.signed for label in labels):
+        return labels
+    votes = sum(_ways(labels, signed=False)) if table.timed else 0
+    if votes > 0:
+        return labels
+    smaller = "the forward runs lead to smaller positions: they are the negative direction"
+    unknown = "forward was taken as the positive direction: the file gives no times that tell the travel"
+    table.given.notes.append(smaller if votes else unknown)
+    other = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True)) if votes else {}
+    return [replace(label, direction=other.get(label.direction, label.direction)) for label in labels]
 
 
 def _state_directions(directions: Directions, runs: int) -> list[str]:
@@ -851,20 +843,34 @@ def _find_block(grid: Grid) -> WideTable | None:
     if width * len(grid.rows) > _MOST_CELLS:
         return None
     cells = [[*fields, *[""] * (width - len(fields))] for _, fields in grid.rows]
-    lines = [line for line, _ in grid.rows]
     for at, row in enumerate(cells):
         headings = [read_heading(text) for text in row]
         # Without a column of positions, that of the targets gives them: "Target" is the usual word for both.
         name = "position" if any(heading.role == "position" for heading in headings) else "target"
-        for column, heading in enumerate(headings):
-            if heading.role == name:
-                found = _positions_below(grid, cells, lines, at, column, heading)
-                if found is not None:
-                    return found
-        found = _positions_in_one_row(grid, cells, lines, at)
-        if found is not None:
-            return found
+        below = (_positions_below(grid, cells, at, column) for column, one in enumerate(headings) if one.role == name)
+        for found in (*below, _positions_in_one_row(grid, cells, at)):
+            if found is not None and (read := _read_runs(grid, found.candidates))[0]:
+                ignored, titles = (
+                    [*found.beside, *read[1]],
+                    [text for fields in cells[: found.first] for text in fields],
+                )
+                unit = found.unit or _position_unit(titles)
+                return WideTable(
+                    grid, grid.rows[at][0], found.positions, unit, _deviation_unit(titles), read[0], ignored
+                )
     return None
+
+
+class _Found(NamedTuple):
+    """What may be a table of position by run: row of its first values, line and text of each position, their unit, headings, values and
+    place of what may be runs, and what else stands in the row of the positions.
+    """
+
+    first: int
+    positions: list[tuple[int, str]]
+    unit: Unit | None
+    candidates: list[tuple[list[str], list[tuple[int, str]], str]]
+    beside: list[str]
 
 
 def _is_number(text: str, numerals: Numerals) -> bool:
@@ -875,56 +881,42 @@ def _is_number(text: str, numerals: Numerals) -> bool:
     return True
 
 
-def _positions_below(
-    grid: Grid, cells: list[list[str]], lines: list[int], at: int, column: int, heading: Heading
-) -> WideTable | None:
-    """Return the table whose positions stand below their heading, with one run per column to the right."""
+def _positions_below(grid: Grid, cells: list[list[str]], at: int, column: int) -> _Found | None:
+    """Return positions that stand below their heading, with what may be a run in each column to the right."""
     near = range(at + 1, min(at + 1 + _ROWS_BELOW, len(cells)))
     first = next((i for i in near if _is_number(cells[i][column], grid.numerals)), len(cells))
     data = [i for i in range(first, len(cells)) if _is_number(cells[i][column], grid.numerals)]
-    if len(data) < _FEWEST_TARGETS:
-        return None
-    if heading.role == "target" and [cells[i][column] for i in data] == [str(k + 1) for k in range(len(data))]:
+    heading, texts = read_heading(cells[at][column]), [cells[i][column] for i in data]
+    numbered = heading.role == "target" and texts == [str(k + 1) for k in range(len(data))]
+    if len(data) < _FEWEST_TARGETS or numbered:
         return None
     above = [i for i in range(max(0, at - _ROWS_ABOVE), at) if _names_runs(cells[i][column + 1 :])]
     block = [cells[i] for i in (*above, *range(at, first))]
-    if len(block) > 1:
-        block = [_fill(row, column + 1) for row in block]
+    block = [_fill(row, column + 1) for row in block] if len(block) > 1 else block
     candidates = [
-        ([row[j] for row in block if row[j]], [(lines[i], cells[i][j]) for i in data], f"column {j + 1}")
+        ([row[j] for row in block if row[j]], [(grid.rows[i][0], cells[i][j]) for i in data], f"column {j + 1}")
         for j in range(column + 1, len(cells[at]))
     ]
-    runs, ignored = _read_runs(grid, [one for one in candidates if one[0] or any(text for _, text in one[1])])
-    titles = [text for row in cells[:first] for text in row]
+    filled = [one for one in candidates if one[0] or any(text for _, text in one[1])]
     unit = heading.unit or unit_of_test(cells[first - 1][column])
-    positions = [(lines[i], cells[i][column]) for i in data]
-    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored) if runs else None
+    return _Found(first, [(grid.rows[i][0], cells[i][column]) for i in data], unit, filled, [])
 
 
-def _positions_in_one_row(grid: Grid, cells: list[list[str]], lines: list[int], at: int) -> WideTable | None:
-    """Return the table whose positions stand in one row, with one run per row below and its labels before the numbers."""
-    row = cells[at]
-    labels = [
-        j for j, text in enumerate(row) if read_heading(text.split("\\")[0]).role in ("run", "cycle", "direction")
-    ]
-    if not labels:
-        return None
-    after = max(labels) + 1
-    split = [split_unit(text) for text in row]
-    places = [j for j in range(after, len(row)) if _is_number(split[j][0], grid.numerals)]
+def _positions_in_one_row(grid: Grid, cells: list[list[str]], at: int) -> _Found | None:
+    """Return positions that stand in one row, with what may be a run in each row below, its labels before the numbers."""
+    named = [read_heading(text.split("\\")[0]).role in ("run", "cycle", "direction") for text in cells[at]]
+    labels, split = [j for j, label in enumerate(named) if label], [split_unit(text) for text in cells[at]]
+    after = max(labels, default=len(split)) + 1
+    places = [j for j in range(after, len(split)) if _is_number(split[j][0], grid.numerals)]
     if len(places) < _FEWEST_TARGETS:
         return None
     candidates = [
-        ([cells[i][j] for j in labels if cells[i][j]], [(lines[i], cells[i][j]) for j in places], f"line {lines[i]}")
-        for i in range(at + 1, len(cells))
-        if any(cells[i])
+        ([row[j] for j in labels if row[j]], [(line, row[j]) for j in places], f"line {line}")
+        for (line, _), row in zip(grid.rows[at + 1 :], cells[at + 1 :], strict=True)
     ]
-    runs, ignored = _read_runs(grid, candidates)
-    ignored = [row[j] for j in range(after, len(row)) if row[j] and j not in places] + ignored
-    titles = [text for fields in cells[: at + 1] for text in fields]
-    unit = next((split[j][1] for j in places if split[j][1]), None) or _position_unit(titles)
-    positions = [(lines[at], split[j][0]) for j in places]
-    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored) if runs else None
+    unit = next((split[j][1] for j in places if split[j][1]), None)
+    beside = [cells[at][j] for j in range(after, len(split)) if cells[at][j] and j not in places]
+    return _Found(at + 1, [(grid.rows[at][0], split[j][0]) for j in places], unit, candidates, beside)
 
 
 def _fill(row: Sequence[str], start: int) -> list[str]:
@@ -1022,7 +1014,12 @@ def _position_unit(titles: Sequence[str]) -> Unit | None:
 def read_wide_table(table: WideTable, stated: Stated) -> Readings:
     """Read the values of a table of position by run."""
     numerals = table.grid.numerals
-    deviation = table.deviation_unit or next((run.unit for run in table.runs if run.unit), None)
+    of_runs = next((run.unit for run in table.runs if run.unit), None)
+    if table.deviation_unit and of_runs not in (None, table.deviation_unit):
+        raise LaserFormatError(
+            f"{table.grid.place}: the deviations are in {table.deviation_unit.name} by the title and in {of_runs.name} by the headings of "
+            "the runs; correct one of them"
+        )
     numbers = [run.number for run in table.runs]
     numbered = None not in numbers
     if not numbered and any(number is not None for number in numbers):
@@ -1038,8 +1035,9 @@ def read_wide_table(table: WideTable, stated: Stated) -> Readings:
     ]  # fmt: skip
     return _read_labels(
         _Labelled(
-            table.grid, table.line, Readings(table.grid.path, ignored=table.ignored), labels, table.position_unit, deviation,
-            numbered=numbered, cycles=numbered and {run.direction for run in table.runs} in ({"positive"}, {"negative"}),
+            table.grid, table.line, Readings(table.grid.path, ignored=table.ignored), labels, table.position_unit,
+            table.deviation_unit or of_runs, numbered=numbered,
+            cycles=numbered and {run.direction for run in table.runs} in ({"positive"}, {"negative"}),
         ),
         stated,
     )  # fmt: skip
@@ -1320,7 +1318,9 @@ def _environment_table(path: Path) -> tuple[DelimitedTable, str, dict[str, tuple
             headings = {heading.role: heading for heading in map(read_heading, fields)}
             columns = {name: headings[name] for _, name, *_ in ENVIRONMENT_COLUMNS if name in headings}
             lacking = [
-                column for column, name, *_ in ENVIRONMENT_COLUMNS if name not in columns or not columns[name].unit
+                f"a unit of {columns[name].text!r} that is read" if name in columns else column
+                for column, name, *_ in ENVIRONMENT_COLUMNS
+                if name not in columns or not columns[name].unit
             ]
             lacking += [] if "time" in headings else ["time"]
             if lacking:

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, date, datetime
 from functools import cached_property, lru_cache
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -99,22 +100,34 @@ class DateOrder:
         if open_question is not None and len(orders) > 1:
             line, text = open_question
             raise LaserFormatError(
-                f"{path}, line {line}: {text!r} may have the day or the month first, and no date of the file resolves it; "
-                "write the dates as 2026-03-09"
+                f"{path}, line {line}: {text!r} may be {_either(possible_dates(text))}, and no date of the file resolves it; write the "
+                "dates as 2026-03-09"
             )
         return cls(next(iter(orders)) if len(orders) == 1 else "")
 
 
 def possible_dates(text: str) -> dict[str, date]:
-    """Return the dates that a text may mean, by the order of its numbers; none where the order is plain, as with dots or a year first."""
+    """Return the dates that a text may mean, by the order of its numbers; none where a year of four digits is first.
+
+    With dots the day is first, or the year where that is the later date: 26.03.09.
+    """
     match = _NUMERIC.fullmatch(text.strip())
-    if match is None or len(match["a"]) == 4 or match["mark"] == ".":
+    if match is None or len(match["a"]) == 4:
         return {}
     numbers, found = (match["a"], match["b"], match["c"]), dict[str, date]()
     for order, (year, month, day) in _ORDERS.items():
         with suppress(ValueError):
             found[order] = date(_year(numbers[year]), int(numbers[month]), int(numbers[day]))
+    if match["mark"] == ".":
+        found.pop("month first", None)
+        if len(found) > 1 and found["year first"] < found["day first"]:
+            del found["year first"]
     return found
+
+
+def _either(possible: Mapping[str, date]) -> str:
+    """Return the dates that a text may mean, in words."""
+    return " or ".join(f"{day} ({order})" for order, day in possible.items())
 
 
 def closest_orders(texts: Iterable[str]) -> list[str]:
@@ -169,15 +182,13 @@ def _date(match: re.Match[str], order: DateOrder, wrong: BadReading, text: str) 
     a, b, c = match["a"], match["b"], match["c"]
     possible = possible_dates(text) if match.re is _NUMERIC else {}
     if len({*possible.values()}) > 1 and not order.first:
-        raise BadReading(text, "may have the day or the month first; write the date as 2026-03-09")
+        raise BadReading(text, f"may be {_either(possible)}; write the date as 2026-03-09")
     try:
         if match.re is _NAMED:
             name, day = (b, a) if a.isdecimal() else (a, b)
             return date(_year(c), _MONTHS[name.casefold()], int(day))
         if len(a) == 4:
             return date(int(a), int(b), int(c))
-        if match["mark"] == ".":
-            return date(_year(c), int(b), int(a))
         return possible[order.first or next(iter(possible), "")]
     except (KeyError, ValueError):
         raise wrong from None
@@ -421,7 +432,7 @@ class Grid:
     @cached_property
     def numerals(self) -> Numerals:
         """How the numbers of the grid are written."""
-        return Numerals.of(text for _, fields in self.rows for text in fields)
+        return Numerals.of_columns(zip_longest(*(fields for _, fields in self.rows), fillvalue=""))
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,8 @@ _DIGITS = {"Y": 4, "m": 2, "d": 2, "H": 2, "M": 2, "S": 2, "j": 3}
 _MOST_PIXELS = 1 << 24
 #: Nine hours at 30 Hz.
 _MOST_FRAMES = 1_000_000
+#: Between these are usual values of pictures of machines, degC; others are in another unit.
+_RANGE_DEGC = (-100.0, 200.0)
 
 
 class StackError(ThermographyError):
@@ -139,6 +141,7 @@ class StackContents:
     elapsed : times since a start that the file does not state, None where it holds none
     emissivity, reflected_temperature_K : with which the temperatures were calculated, where the file says it
     notes : what of the file was passed over
+    middle : a usual value of a text, NaN of other files
     """
 
     frames: int
@@ -150,6 +153,7 @@ class StackContents:
     emissivity: float | None = None
     reflected_temperature_K: float | None = None
     notes: tuple[str, ...] = ()
+    middle: float = float("nan")
 
 
 class TemperatureReader(ABC):
@@ -190,6 +194,11 @@ class TemperatureReader(ABC):
         unit = options.unit or contents.unit
         if unit not in ("degC", "K"):
             raise StackError(f'{path}: nothing says whether values are degC or K; write unit = "degC" or unit = "K"')
+        degC = contents.middle * options.scale + options.offset - (ZERO_CELSIUS_K if unit == "K" else 0.0)
+        if not (np.isnan(degC) or _RANGE_DEGC[0] < degC < _RANGE_DEGC[1]):
+            raise ThermographyError(
+                f"{path}: values as {contents.middle:g} are not in {unit}; export all frames in one unit"
+            )
         for index, time in enumerate(_times(path, contents, options)):
             yield TemperatureFrame(
                 parameters=options.parameters,
@@ -711,8 +720,8 @@ class TextReader(TemperatureReader):
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a file holds; the pixels of numbers alone are counted and not read."""
-        if shape := _plain_shape(_content(path)):
-            return StackContents(1, shape)
+        if plain := _plain_shape(_content(path)):
+            return StackContents(1, plain[0], middle=plain[1])
         frames, unit = _text_frames(path, *_state(path))
         head = _heading(path)
         own, emissivity, reflected = (pattern.search(head) for pattern in (_OWN_EXPORT, _EMISSIVITY, _REFLECTED))
@@ -725,6 +734,7 @@ class TextReader(TemperatureReader):
             zoned=own is not None,
             emissivity=float(emissivity[1].replace(",", ".")) if emissivity else None,
             reflected_temperature_K=_kelvin(*reflected.groups()) if reflected else None,
+            middle=float(np.nanmedian(frames)),
         )
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
@@ -910,8 +920,8 @@ def _kelvin(value: str, unit: str) -> float:
     return {"K": number, "C": number + ZERO_CELSIUS_K, "F": (number - 32.0) / 1.8 + ZERO_CELSIUS_K}[unit.upper()]
 
 
-def _plain_shape(content: bytes) -> tuple[int, int] | None:
-    """Return rows and columns of a text of numbers alone, of which every line holds as many; None of another one."""
+def _plain_shape(content: bytes) -> tuple[tuple[int, int], float] | None:
+    """Return rows and columns of a text of numbers alone, of which every line holds as many, and a usual one; None of another one."""
     lines = content.removeprefix(codecs.BOM_UTF8).splitlines()
     if len(lines) > _MOST_LINES or content.removeprefix(codecs.BOM_UTF8).translate(None, _PLAIN):
         return None
@@ -920,7 +930,8 @@ def _plain_shape(content: bytes) -> tuple[int, int] | None:
         if len(columns) == 1 and _has_proportions(len(lines), width := columns.pop()):
             corner = np.array([[_number(text.decode()) for text in line.split(delimiter)[:4]] for line in lines[:4]])
             numbered = (corner[0] % 1.0 == 0.0).all() or (corner[:, 0] % 1.0 == 0.0).all()
-            return None if numbered or np.isnan(corner).any() or len(lines) > _HIGHEST * width else (len(lines), width)
+            bad = numbered or np.isnan(corner).any() or len(lines) > _HIGHEST * width
+            return None if bad else ((len(lines), width), float(np.median(corner)))
     return None
 
 

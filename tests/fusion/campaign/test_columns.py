@@ -769,3 +769,102 @@ def test_marks_between_thousands_of_whole_numbers_are_no_decimal_marks(tmp_path:
     data = read_record(load_campaign(write_campaign(tmp_path, Asker(None))[0]))
     np.testing.assert_allclose(data["displacement"].values[:, 0], 0.9 + 0.003 * np.arange(100))
     np.testing.assert_allclose(data["temperature"].values[:, 0], 20 + np.arange(100) / 100, atol=1e-9)
+
+
+def table(path: Path, *heading: str, row: str = "{m:.1f},{t1},{z}") -> Path:
+    """A table of the test below lines of headings."""
+    path.write_text("\n".join(heading) + "\n" + rows(row))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("heading", "row", "refused"),
+    [
+        ("Time [min];T1 [degC];Z [um]", "{m:.1f};{t1};1,{k:03d}", "line 2: '1,000' in the column .* may part thousands or"),
+        ("Time_T [min],T1 [degC],Time_Z [min],Z [mm]", "{m},{t1},{m:.0f}{k:03d},{z}", '"Time_T .* and "Time_Z .* do not run alike'),
+        ("Time [min],T1 [degC],Time [min],Z [mm]", "{m},{t1},{k}5,{z}", "do not run alike"),
+        ("Time [min],T1 [degC],Z [mm]\nmin,degC,um", "{m},{t1},{z}", r'"Z \[mm\]" is in mm by its heading and in um by its row'),
+        ("Time [min],T1 [degC],Z [mm]", "{m},{t1},{z} um", r'"Z \[mm\]" is in mm by its heading and in um by its cells'),
+    ],
+)  # fmt: skip
+def test_what_two_places_of_a_table_tell_differently_is_refused(tmp_path: Path, heading: str, row: str, refused: str) -> None:  # fmt: skip
+    with pytest.raises((TableError, LaserFormatError), match=refused):
+        propose_table(table(tmp_path / "log.csv", heading, row=row))
+
+
+@pytest.mark.parametrize(
+    ("heading", "row", "first"),
+    [
+        (["t in min,T1 [degC],Z [mm]"], "{m},{t1},{z}", "1970-01-01T00:00"),
+        (["Zeit in Min.,T1 [degC],Z [mm]"], "{m},{t1},{z}", "1970-01-01T00:00"),
+        (["min,T1 [degC],Z [mm]"], "{m},{t1},{z}", "1970-01-01T00:00"),
+        (["time_min,[degC] T1,Z (mm) left"], "{m},{t1},{z}", "1970-01-01T00:00"),
+        (["Time - T1 (min),T1 (degC),Time - Z (min),Z (mm)"], "{m},{t1},{m},{z}", "1970-01-01T00:00"),
+        (["Time,Temperature [degC],Displacement [mm],", ",front,X,Y"], "{time},{t1},{z},1{z}", "2026-03-09T22:30"),
+        (["Time,Temp,Z,U", "min,degC,mm,V"], "{m},{t1},{z},0.1", "1970-01-01T00:00"),
+        (["Temperature unit: Fahrenheit", "Length unit: um", "", "Time [min],T1,Z"], "{m},7{t1},{z}", "1970-01-01T00:00"),
+        (["Time zone;+02:00;", "", "Time;T1 [degC];Z [mm]"], "{time};{t1};{z}", "2026-03-09T20:30"),
+        (["Time zone;Europe/Vienna;", "", "Time;T1 [degC];Z [mm]"], "{time};{t1};{z}", "2026-03-09T21:30"),
+        (["Time,ms,T1 [degC],Z [mm]"], "{time:%Y-%m-%d %H:%M},{time:%S}0,{t1},{z}", "2026-03-09T22:30"),
+        (["Time [min],Value,Unit,Z,Z Unit"], "{m},{t1},Degree C,{z},mm", "1970-01-01T00:00"),
+        (["Time [min],T1 [degC],Z [um]"], "{m},{t1},1’{k:03d}", "1970-01-01T00:00"),
+    ],
+)  # fmt: skip
+def test_units_zones_and_names_are_read_wherever_a_table_states_them(
+    tmp_path: Path, heading: list[str], row: str, first: str
+) -> None:
+    found = propose_table(table(tmp_path / "log.csv", *heading, row=row))
+    assert not found.asked and found.time[0] == np.datetime64(first) and found.time.size == MINUTES.size
+    assert found.of("temperature") and found.of("displacement") and all(one.told for one in found.of("displacement"))
+    assert (found.of("temperature")[0].unit == "degF") == ("Fahrenheit" in heading[0])
+
+
+def test_what_is_no_reading_of_the_machine_is_not_used(tmp_path: Path) -> None:
+    heading = "Date Time,Time (min),Cycle time [s],T1 [degC],T1 std [degC],u(T1) [degC],± [degC],T1 limit [degC],"
+    heading += "Dew point [degC],dT/dt [K/min],n [rpm],X position [mm],Z [mm],Z err [mm],Y Last [mm]"
+    found = propose_table(
+        table(tmp_path / "log.csv", heading, row="{time},{m},3{k},{t1}" + ",0.1{k}" * 6 + ",{n},{k},{z},0.01{k},{z}")
+    )
+    assert [[one.heading for one in found.of(role)] for role in ("temperature", "displacement", "driver")] == [
+        ["T1 [degC]"], ["Z [mm]", "Y Last [mm]"], ["n [rpm]"],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "order"), [("26.03.09", "year first"), ("26-03-09", "year first"), ("09.03.26", "")])
+def test_years_of_two_digits_are_asked_where_the_later_date_has_them_first(
+    tmp_path: Path, text: str, order: str
+) -> None:
+    lines = "".join(f"{text} 08:{k:02d};{20 + k / 7:.2f};{k / 90:.4f}\n" for k in range(60))
+    (tmp_path / "log.csv").write_text("Time;T1 [degC];Z [mm]\n" + lines)
+    found = propose_table(tmp_path / "log.csv")
+    assert found.time[0] == np.datetime64("2026-03-09T08:00") and found.keys.get("date_order", "") == order
+    assert ("date_order" in found.asked) == bool(order)
+
+
+def test_times_that_are_not_understood_are_named(tmp_path: Path) -> None:
+    found = propose_table(table(tmp_path / "log.csv", "Time,T1 [degC],Z [mm]", row="8 h past {k},{t1},{z}"))
+    assert found.asked["every"] == "'8 h past 0' in the column \"Time\", line 2, is no time that is read"
+
+
+def test_sheets_of_one_time_belong_together_and_two_runs_are_asked(tmp_path: Path) -> None:
+    def book(name: str, **sheets: list[tuple[object, ...]]) -> Path:
+        workbook = openpyxl.Workbook()
+        for title, lines in sheets.items():
+            sheet = workbook.create_sheet(title)
+            for line in lines:
+                sheet.append(line)
+        workbook.remove(workbook.active)
+        (tmp_path / name).mkdir()
+        workbook.save(tmp_path / name / "log.xlsx")
+        return tmp_path / name
+
+    stamps, head = STAMPS.astype(object), ("Time", "T1 [degC]", "Z [mm]")
+    hot, moved = (
+        [line, *zip(stamps, values, strict=True)] for line, values in ((head[:2], SPINDLE), (head[::2], NOSE))
+    )
+    apart = book("apart", Notes=[("Mill", 4)], A=hot, B=moved)
+    data = read_record(load_campaign(write_campaign(apart, Asker(None))[0]))
+    np.testing.assert_allclose(data["displacement"].values[:, 0], 1e3 * NOSE)
+    np.testing.assert_allclose(data["temperature"].values[:, 0], SPINDLE)
+    lines = [head, *zip(stamps, SPINDLE, NOSE, strict=True)]
+    assert propose_table(book("runs", Run1=lines, Run2=lines) / "log.xlsx").asked == {"sheet": "Run2"}

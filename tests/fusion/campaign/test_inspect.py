@@ -195,7 +195,7 @@ UNREAD = [
     ("a.csv", ",".join(["20"] * 50_000), "columns; the file is damaged or no table"),
     ("a.toml", "[tool]\nx = 1\n", "neither a campaign nor a recipe"),
     ("a.toml", "[tool\n", "this is not TOML"),
-    ("a.md", "# Notes\n\nNothing measured.\n", "no table of deviations"),
+    ("a.md", "# Notes\n\nNothing measured.\n", "no rows of numbers"),
     ("a.xlsx", write_sheet({"a": [0, 1]}), "without a temperature and a displacement"),
     ("a.bin", "\0\1\2", "is a zero byte, so the file is not text"),
     ("a.csv", "hours [h],T1 [degC]\n0,20\n1,21\n2,22\n", "without a displacement"),
@@ -289,7 +289,7 @@ def test_a_file_on_which_a_reader_fails_is_not_used_and_stops_no_other(tmp_path,
     # A table that one reader refuses may be one of another kind: here it is none.
     declared = replace(Kind.RECORD.value, sniff=fails, may_be=lambda found: False)
     monkeypatch.setattr(Kind.RECORD, "_value_", declared)
-    monkeypatch.setattr("fusion.campaign.inspect.Recognised.logged", None)
+    monkeypatch.setattr("fusion.campaign.inspect.Recognised.logged", "")
     content = scan_folder(tmp_path)
     assert [one.path.name for one in content.of(Kind.REGIONS)] == ["b.csv"]
     (unused,) = content.unknown
@@ -492,3 +492,16 @@ def test_a_picture_as_a_list_of_pixels_is_no_record(tmp_path):
     path.write_text("x,y,T\n" + "".join(f"{x},{y},{20 + x / 7:.3f}\n" for y in range(12) for x in range(16)))
     found = recognise(path)
     assert found.kind is Kind.UNKNOWN and found.reason.startswith("a list of pixels; export the picture")
+
+
+def test_a_table_of_a_laser_with_temperatures_beside_is_no_record(tmp_path):
+    there = [
+        (cycle, sign, x) for cycle in (1, 2) for sign in "+-" for x in range(0, 500, 100)[:: 1 if sign == "+" else -1]
+    ]
+    lines = [
+        f"2026-03-09 08:{k:02d},{cycle},{sign},{x},0.{k:03d},20.{k:02d}" for k, (cycle, sign, x) in enumerate(there)
+    ]
+    (tmp_path / "a.csv").write_text(
+        "\n".join(["Time,Run,Direction,Target (mm),Error (um),Air temp (degC)", *lines]) + "\n"
+    )
+    assert recognise(tmp_path / "a.csv").kind is Kind.DEVIATIONS

@@ -22,21 +22,19 @@ from interferometry.io.readings import (
     passes_by_order,
     read_deviations,
     read_environment,
-    turn_by_travel,
 )
 from interferometry.io.tables import read_grids
 from tests.interferometry.io.test_workbook import write_ods
 from tests.interferometry.laser_mutations import fuzz
 
-NAT = np.datetime64("NaT", "ns")
 
-
-def test_what_times_do_not_tell_is_noted():
-    cells = ((1, "positive", 1, 0.0), (1, "positive", 2, 20.0))
-    readings = Readings(Path("t.csv"), "length", [Reading(2 + i, *cell, NAT, 0.0) for i, cell in enumerate(cells)])
-    turn_by_travel(readings)
-    assert [reading.direction for reading in readings.readings] == ["positive", "positive"]
-    assert json.loads(check_and_assemble(readings).attrs["notes"]) == [
+def test_what_times_do_not_tell_is_noted(tmp_path):
+    (tmp_path / "t.csv").write_text(
+        "run,direction,position [mm],deviation [um]\n1,forward,0,0\n1,forward,20,0\n1,back,9,\n"
+    )
+    test = read_deviations(tmp_path / "t.csv")
+    assert np.isfinite(test["deviation"].sel(direction="positive").values).sum() == 2
+    assert json.loads(test.attrs["notes"]) == [
         "forward was taken as the positive direction: the file gives no times that tell the travel"
     ]
     cells = ((1, "positive", 1, 0.0), (1, "positive", 2, 20.0), (1, "negative", 2, 20.0))
@@ -504,7 +502,7 @@ def test_a_mark_for_no_reading_is_no_value(tmp_path, mark):
         ),
         ("cycle,direction,position_mm,deviation_degC", "{c},{d},{p},{e}", "positions in mm, deviations in degC; give"),
         (f"{HEADER},error_um", f"{LINE},{{e}}", "'deviation_um' and 'error_um' both name the deviation"),
-        (HEADER, LINE.replace("2026-03-09T", "3/9/2026 "), "line 2: '3/9/2026 .* the day or the month first"),
+        (HEADER, LINE.replace("2026-03-09T", "3/9/2026 "), "line 2: '3/9/2026 .* may be 2026-09-03 .* or 2026-03-09"),
         (
             "cycle,position_mm,deviation_um",
             "{c},{p},{e}",
@@ -753,3 +751,19 @@ def test_one_wide_line_above_many_short_ones_does_not_fill_the_memory(tmp_path):
     assert find_wide_table(grid) is None
     assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size + 200e6
     tracemalloc.stop()
+
+
+def test_a_title_and_headings_in_two_units_are_refused(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("Deviations in um\nPosition [mm];1+ [mm];1- [mm]\n0;0.001;0.002\n100;0.003;0.004\n")
+    with pytest.raises(LaserFormatError, match="in um by the title and in mm by the headings"):
+        read_deviations(path)
+
+
+def test_a_column_that_may_part_thousands_beside_decimal_commas_is_refused(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("Position [mm];1+ [um];1- [um]\n0,0;1.050;1.150\n100,0;1.060;1.160\n200,0;1.070;1.170\n")
+    with pytest.raises(LaserFormatError, match=r"'1\.050' may part thousands or decimals"):
+        read_deviations(path)
+    path.write_text("Position [mm];1+ [nm];1- [nm]\n0,0;950;1.150\n100,0;1.060;160\n200,0;1.070;170\n")
+    assert read_deviations(path)["deviation"].values[0, 0].tolist() == [0.95, 1.06, 1.07]

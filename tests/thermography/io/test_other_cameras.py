@@ -702,3 +702,13 @@ def test_bytes_before_the_first_frame_of_a_sequence_do_not_hide_it(tmp_path):
     (tmp_path / "a.seq").write_bytes(b"\x07" * 100 + (tmp_path / "a.seq").read_bytes())
     frames, (rejected,) = index_recordings([tmp_path / "a.seq"])
     assert [frame.index for frame in frames] == [1, 2, 3] and "expected a JPEG" in rejected.reason
+
+
+def test_frames_of_text_in_another_unit_are_left_out_by_name(tmp_path):
+    rng = np.random.default_rng(4)
+    for k, zero in enumerate((22.0, 295.15)):
+        np.savetxt(tmp_path / f"f_2026030908000{k}.csv", zero + rng.random((24, 32)), fmt="%.2f", delimiter=";")
+    frames, rejected = index_recordings(
+        sorted(tmp_path.iterdir()), StackOptions(unit="degC", time_in_name="%Y%m%d%H%M%S")
+    )
+    assert len(frames) == 1 and "are not in degC" in rejected[0].reason
