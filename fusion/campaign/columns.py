@@ -13,26 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from fusion.campaign import logs
 from fusion.campaign.config import HeaderRows, LoggedTable
-from fusion.campaign.logs import (
-    HEAD,
-    MONITORED,
-    PARTS,
-    ROWS_OF_VALUES,
-    VALUE,
-    Rows,
-    first_of_values,
-    is_fraction,
-    numbers_in,
-    parts_of_time,
-    read_rows,
-    read_times,
-    sheet_of,
-    stripped,
-    text_lines,
-    unwrapped,
-    written_times,
-)
 from fusion.campaign.values import (
     DAY_NUMBERS,
     TIME_UNITS,
@@ -49,19 +31,9 @@ from fusion.campaign.values import (
 from fusion.common import FusionError
 from fusion.results.numbers import span
 from fusion.results.progress import listed
+from interferometry.io import tables
 from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine
 from interferometry.io.spreadsheets import cell_text, is_workbook
-from interferometry.io.tables import (
-    DateOrder,
-    closest_orders,
-    delimiter_of_values,
-    elapsed_s,
-    fields_of,
-    parse_time,
-    possible_dates,
-    read_heading,
-    where_clock_goes_back,
-)
 from thermofuse.resources import by_word, vocabulary
 from thermofuse.units import SHARE, find_unit
 
@@ -256,9 +228,9 @@ class TableProposal:
         return replace(self, columns=tuple(columns), keys=keys, asked=asked)
 
 
-def propose_runs(tables: Sequence[TableProposal]) -> TableProposal:
+def propose_runs(proposals: Sequence[TableProposal]) -> TableProposal:
     """Propose for several tables with the same headings: as for the first, without the columns that one of them cannot give."""
-    first, *others = tables
+    first, *others = proposals
     lost = {column.heading for other in others for column in other.of("out") if column.remark == _NO_NUMBERS}
     columns = [
         replace(one, role="out", remark="not in every run") if one.heading in lost else one for one in first.columns
@@ -273,7 +245,7 @@ def propose_table(path: Path) -> TableProposal:
     sheet = next(iter(sheets), None)
     keys = _of_labview(head) or _of_campbell(head) or _of_monitor(head) or _header_rows(path, head)
     header = HeaderRows.model_validate(keys["header_rows"]) if "header_rows" in keys else None
-    rows = read_rows(path, sheet=sheet, header=header)
+    rows = logs.read_rows(path, sheet=sheet, header=header)
     keys |= {"sheet": sheet} if sheet else {}
     frame, asked = rows.frame, {"sheet": " or ".join(sheets[1:])} if sheets[1:] else {}
     if frame.empty:
@@ -281,7 +253,7 @@ def propose_table(path: Path) -> TableProposal:
     units = dict[str, str]()
     keys |= {} if "long" in keys else _long(rows, asked, units)
     if "long" in keys:
-        channels = frame.groupby(stripped(frame[keys["long"]["channel"]]).replace("", None))
+        channels = frame.groupby(logs.stripped(frame[keys["long"]["channel"]]).replace("", None))
         groups = {str(name): values[keys["long"]["value"]] for name, values in channels}
         columns, marks = _columns(groups, units)
         if all(column.remark == _BY_VALUES for column in columns if column.role == "temperature"):
@@ -307,7 +279,7 @@ def propose_table(path: Path) -> TableProposal:
         elif steps and one.remark == _COUNTS:
             columns[k] = replace(one, unit=f"{steps[0]} mm", remark="counts, of step_dist")
     if marks:
-        rows = read_rows(path, sheet=sheet, header=header, missing=marks)
+        rows = logs.read_rows(path, sheet=sheet, header=header, missing=marks)
     time, reference, lines, refused = _read(path, rows, keys)
     lost = {line.line for line in lines["left_out"]}
     used = [name for one in columns if one.role in ROLES[1:-1] for name in rows.marks.get(one.heading, ())]
@@ -326,7 +298,7 @@ def propose_table(path: Path) -> TableProposal:
 
 
 def _read(
-    path: Path, rows: Rows, keys: Mapping[str, Any]
+    path: Path, rows: logs.Rows, keys: Mapping[str, Any]
 ) -> tuple[np.ndarray, str, dict[str, list[RejectedLine]], str]:
     """Return the times of a table, how they came to UTC in words, by the attribute that holds them the lines that a record leaves out, and
     those at which its clock goes back, and why a record refuses them.
@@ -335,11 +307,15 @@ def _read(
     if headings is None:
         return np.array([], "M8[ns]"), "", {"left_out": rows.left_out}, ""
     layout = LoggedTable.model_validate({key: value for key, value in keys.items() if key not in ("long", "time")})
-    time, reference, without = read_times(path, rows, layout, [headings] if isinstance(headings, str) else headings)
+    time, reference, without = logs.read_times(
+        path, rows, layout, [headings] if isinstance(headings, str) else headings
+    )
     keep = ~np.isnat(time)
     lines, refused = {"left_out": sorted([*rows.left_out, *without], key=lambda line: line.line)}, ""
     try:
-        lines["clock"] = [] if "long" in keys else where_clock_goes_back(path, rows.frame.index[keep], time[keep])
+        lines["clock"] = (
+            [] if "long" in keys else tables.where_clock_goes_back(path, rows.frame.index[keep], time[keep])
+        )
     except LaserFormatError as error:
         refused = str(error).removeprefix(f"{path}, ")
     return time[keep], reference, lines, refused
@@ -375,12 +351,14 @@ def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple
 def _head(path: Path) -> tuple[list[str], list[tuple[int, str, list[str]]]]:
     """Return the sheet of a table and others like it, none of a text, and its first lines that are not empty: number, text and fields."""
     if is_workbook(path.read_bytes()):
-        name, rows, alike = sheet_of(path)
+        name, rows, alike = logs.sheet_of(path)
         sheets = [name, *alike] if name else []
-        return sheets, [(line, "", [cell_text(cell) for cell in cells]) for line, cells in rows[:HEAD]]
-    lines = text_lines(path)[:HEAD]
-    delimiter = delimiter_of_values(max(lines[len(lines) // 2 :], key=lambda line: len(line.strip()), default=""))
-    split = ((k, line, [text.strip() for text in fields_of(line, delimiter)]) for k, line in enumerate(lines, 1))
+        return sheets, [(line, "", [cell_text(cell) for cell in cells]) for line, cells in rows[: logs.HEAD]]
+    lines = logs.text_lines(path)[: logs.HEAD]
+    delimiter = tables.delimiter_of_values(
+        max(lines[len(lines) // 2 :], key=lambda line: len(line.strip()), default="")
+    )
+    split = ((k, line, [text.strip() for text in tables.fields_of(line, delimiter)]) for k, line in enumerate(lines, 1))
     return [], [row for row in split if row[1].strip()]
 
 
@@ -424,8 +402,8 @@ def _of_campbell(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
 
 def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     """Return the layout of what EPICS' camonitor prints: channel, date, time, value, state of the alarm."""
-    matching = [line for line, text, _ in head if MONITORED.match(text)]
-    if len(matching) < max(ROWS_OF_VALUES, len(head) / 2):
+    matching = [line for line, text, _ in head if logs.MONITORED.match(text)]
+    if len(matching) < max(logs.ROWS_OF_VALUES, len(head) / 2):
         return {}
     return {"header_rows": {"values": 1}, "long": {"time": ["2", "3"], "channel": "1", "value": "4"}}
 
@@ -433,7 +411,7 @@ def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
 def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     """Return where the names, the units and the values of any other table stand, nothing where the names are its first line."""
     rows = [(line, fields) for line, text, fields in head if not text.startswith("#")]
-    first = first_of_values(rows)
+    first = logs.first_of_values(rows)
     if first is None:
         raise LaserFormatError(
             f"{path}: no rows of numbers below one another; export it again with its readings, or move it out of the folder"
@@ -441,7 +419,7 @@ def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str
     width = len(rows[first][1])
     above = [(line, fields) for line, fields in rows[:first] if sum(map(bool, fields)) > width / 2]
     if not above:
-        if not _numbers_channels(rows[first : first + 1 + ROWS_OF_VALUES]):
+        if not _numbers_channels(rows[first : first + 1 + logs.ROWS_OF_VALUES]):
             return {"header_rows": {"values": rows[first][0]}}
         above, first = [rows[first]], first + 1
     header = {"names": above[-1][0], "values": rows[first][0]}
@@ -468,23 +446,23 @@ def _is_over(groups: Sequence[str], names: Sequence[str]) -> bool:
 def _numbers_channels(rows: Sequence[tuple[int, list[str]]]) -> bool:
     """Whether the first row holds names, with channels that are called by whole numbers, above rows of values."""
     (_, names), *values = rows
-    words = [k for k, name in enumerate(names) if name and not VALUE.fullmatch(name)]
+    words = [k for k, name in enumerate(names) if name and not logs.VALUE.fullmatch(name)]
     return (
         bool(words and values)
         and all(name.isdecimal() for k, name in enumerate(names) if name and k not in words)
-        and all(len(fields) == len(names) and VALUE.fullmatch(fields[words[0]].strip()) for _, fields in values)
+        and all(len(fields) == len(names) and logs.VALUE.fullmatch(fields[words[0]].strip()) for _, fields in values)
     )
 
 
-def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str, Any]:
+def _long(rows: logs.Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str, Any]:
     """Return the layout of a table with a line for every change: a time, a name that recurs, a number; add the units of its channels."""
     frame, keys, open_ = rows.frame, dict[str, Any](), dict[str, str]()
-    written = {name: stripped(frame[name]) for name in frame if not pd.api.types.is_numeric_dtype(frame[name])}
+    written = {name: logs.stripped(frame[name]) for name in frame if not pd.api.types.is_numeric_dtype(frame[name])}
     if not 3 <= len(frame.columns) <= _WIDEST_LONG or not written:
         return {}
     times = _times(rows, keys, open_)
     written = {name: texts for name, texts in written.items() if name not in times}
-    numbers = {name for name in written if np.isfinite(numbers_in(frame[name])).mean() > 0.5}
+    numbers = {name for name in written if np.isfinite(logs.numbers_in(frame[name])).mean() > 0.5}
     distinct = {name: set(texts) - {""} for name, texts in written.items()}
     of_units = [name for name, texts in distinct.items() if texts and all(map(is_unit, texts))]
     names = {name: len(texts) for name, texts in distinct.items() if name not in (*numbers, *of_units)}
@@ -504,11 +482,11 @@ def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str,
 # Which column holds the times, and how they are written.
 
 
-def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str, ...]:
+def _times(rows: logs.Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str, ...]:
     """Return the headings of the times; write into `keys` how they are to be read, and into `asked` what nothing tells."""
     frame = rows.frame
-    parts = [str(name) for name in frame.columns if str(name).strip().casefold() in PARTS]
-    whole = parts_of_time(frame, parts)
+    parts = [str(name) for name in frame.columns if str(name).strip().casefold() in logs.PARTS]
+    whole = logs.parts_of_time(frame, parts)
     if whole is not None and _mostly(whole.notna()):
         keys["time"] = parts
         return tuple(parts)
@@ -517,10 +495,10 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
     texts = [
         name
         for name, sample in samples.items()
-        if not _mostly(np.isfinite(numbers_in(pd.Series(sample, dtype=object))))
+        if not _mostly(np.isfinite(logs.numbers_in(pd.Series(sample, dtype=object))))
     ]
     named = [name for name in frame.columns if _is_time_name(name, rows.units.get(name, ""))]
-    days = [name for name in texts if _mostly(np.isfinite(elapsed_s(samples[name])))]
+    days = [name for name in texts if _mostly(np.isfinite(tables.elapsed_s(samples[name])))]
     named = [*(name for name in named if name not in days), *(name for name in named if name in days)]
     # A first column without a name that grows, and does not count rows, is the time.
     for name in [*named, *texts, *(["1"] if frame.columns[0] == "1" and not _counts(frame["1"]) else [])]:
@@ -535,40 +513,40 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
                 asked["time_unit"] += f", in {stated[0]}: {UNIT_NOT_KNOWN}"
             return (name,)
         for columns in ([name, *[two for two in days if two != name][:1]], [name]):
-            written = _sample(written_times(frame, columns))
-            order = _order_of(stripped(written_times(frame, columns)).tolist(), asked)
+            written = _sample(logs.written_times(frame, columns))
+            order = _order_of(logs.stripped(logs.written_times(frame, columns)).tolist(), asked)
             if name in days and columns == [name]:
                 keys["time"], heading = name, f"{name} {rows.units.get(name, '')}"
                 two = all(text.count(":") == 1 for text in written) and not _HOURS_FIRST.search(heading)
                 # Less than 24 minutes would be no test.
-                if _MINUTES_FIRST.search(heading) or (two and np.nanmax(elapsed_s(written)) >= 86400.0):
+                if _MINUTES_FIRST.search(heading) or (two and np.nanmax(tables.elapsed_s(written)) >= 86400.0):
                     keys["time_format"] = "%M:%S"
                     asked |= {} if _MINUTES_FIRST.search(heading) else {"time_format": "%H:%M"}
-                elif two and elapsed_s(written)[0] == 0.0:
+                elif two and tables.elapsed_s(written)[0] == 0.0:
                     # Counted from zero, either; a time of day begins elsewhere.
                     keys["time_format"], asked["time_format"] = "%H:%M", "%M:%S"
                 return (name,)
-            if _mostly([_is_read(text, DateOrder(order)) for text in written]):
+            if _mostly([_is_read(text, tables.DateOrder(order)) for text in written]):
                 behind = list(frame.columns)[list(frame.columns).index(columns[-1]) + 1 :][:1]
                 # Times of whole seconds repeat without it.
-                columns += [one for one in behind if is_fraction(one) and frame[one].nunique() > 1]
+                columns += [one for one in behind if logs.is_fraction(one) and frame[one].nunique() > 1]
                 keys |= {"time": columns if len(columns) > 1 else name} | ({"date_order": order} if order else {})
                 return tuple(columns)
             asked.pop("date_order", None)
     # Times that are not understood are named.
-    places = [(samples[name][0], name, frame[name].first_valid_index()) for name in named if name in texts][:1]
+    places = [(samples[name][0], name, int(frame.index[frame[name].notna()][0])) for name in named if name in texts][:1]
     told = [f'{text!r} in the column "{name}", line {line}, is no time that is read' for text, name, line in places]
     asked["every"] = "".join(told)
     return ()
 
 
-def _refuse_own_times(path: Path, rows: Rows, layout: LoggedTable, time: str) -> None:
+def _refuse_own_times(path: Path, rows: logs.Rows, layout: LoggedTable, time: str) -> None:
     """Refuse a table of which another column of times does not run as the first: its channels have a clock each."""
     for name in filter(_OWN_TIME.match, map(str, rows.frame.columns)):
         stated = (*_stated_units(rows, name), layout.time_unit, *_stated_units(rows, time))
         own = layout.model_copy(update={"time_unit": next((unit for unit in stated if unit in TIME_UNITS), None)})
         try:
-            first, other = read_times(path, rows, layout, [time])[0], read_times(path, rows, own, [name])[0]
+            first, other = logs.read_times(path, rows, layout, [time])[0], logs.read_times(path, rows, own, [name])[0]
         except (FusionError, LaserFormatError):
             continue
         first, other = np.array([first, other])[:, ~(np.isnat(first) | np.isnat(other))].astype("i8")
@@ -579,7 +557,7 @@ def _refuse_own_times(path: Path, rows: Rows, layout: LoggedTable, time: str) ->
             )
 
 
-def _stated_units(rows: Rows, name: str) -> list[str]:
+def _stated_units(rows: logs.Rows, name: str) -> list[str]:
     """Return the units that the row of units and the heading state of a column."""
     alone = name.strip() if unit_name(name.strip()) in TIME_UNITS else ""
     return [unit_name(unit) for unit in (rows.units.get(name, ""), column_unit(name), alone) if unit.strip("- ")]
@@ -594,7 +572,7 @@ def _is_time_name(heading: str, unit: str) -> bool:
 
 def _sample(column: pd.Series) -> list[str]:
     """Return some fifty texts of a column, from all of its rows that have one."""
-    texts = stripped(column.dropna())
+    texts = logs.stripped(column.dropna())
     texts = texts[texts != ""]
     return texts.iloc[:: max(1, len(texts) // 50)].tolist()
 
@@ -605,12 +583,12 @@ def _mostly(each: Iterable[object]) -> bool:
 
 
 def _finite(column: pd.Series) -> np.ndarray:
-    numbers = numbers_in(column)
+    numbers = logs.numbers_in(column)
     return numbers[np.isfinite(numbers)]
 
 
 def _grows(column: pd.Series) -> bool:
-    numbers, _ = unwrapped(_finite(column))
+    numbers, _ = logs.unwrapped(_finite(column))
     return numbers.size > 1 and bool(numbers[-1] > numbers[0]) and float((np.diff(numbers) >= 0).mean()) > 0.98
 
 
@@ -649,21 +627,21 @@ def _place_times(heading: str, numbers: np.ndarray, known: str, keys: dict[str, 
 def _order_of(texts: Sequence[str], asked: dict[str, str]) -> str:
     """Return what stands first in dates, where only their course tells it; write into `asked` what else may."""
     with suppress(LaserFormatError):
-        DateOrder.of(Path(), enumerate(texts))
+        tables.DateOrder.of(Path(), enumerate(texts))
         return ""
     # A clock of AM and PM without blanks is an English one, as dates with the month first are; years of two digits are the latest.
     usual = "month first" if re.search(r"\d ?[AP]M", " ".join(texts)) else "day first"
-    dates = next((found for text in texts if len(found := possible_dates(text)) > 1), {})
+    dates = next((found for text in texts if len(found := tables.possible_dates(text)) > 1), {})
     usual = "year first" if "year first" in dates and dates["year first"] == max(dates.values()) else usual
-    first, *others = sorted(closest_orders(texts), key=usual.__ne__) or [""]
+    first, *others = sorted(tables.closest_orders(texts), key=usual.__ne__) or [""]
     asked |= {"date_order": " or ".join(others)} if others else {}
     return first
 
 
-def _is_read(text: str, order: DateOrder) -> bool:
+def _is_read(text: str, order: tables.DateOrder) -> bool:
     """Whether a text is a time."""
     with suppress(BadReading):
-        return bool(parse_time(text, order))
+        return bool(tables.parse_time(text, order))
     return False
 
 
@@ -678,7 +656,7 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         in_heading = ""  # TC(1), T (air): a number or a word, no unit
     # What the last word of a name means depends on the others: in is an inlet beside a temperature.
     suffixes = _SUFFIXES | _SUFFIXES_OF.get(_word(name)[1], {})
-    behind = read_heading(name).unit
+    behind = tables.read_heading(name).unit
     share = behind.name if behind is not None and SHARE.search(name) else ""
     ending = share or suffixes.get(
         re.split(r"[\s_/,;]+", re.sub(r"\.\d+$", "", name))[-1].casefold().replace("μ", "µ"), ""

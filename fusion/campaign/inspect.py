@@ -249,7 +249,9 @@ def _lists_sensors(found: Recognised) -> bool:
 
 
 def _names_a_record(found: Recognised) -> bool:
-    if found.of_a_laser:
+    from interferometry.io.readings import holds_deviations
+
+    if found.of_a_laser and holds_deviations(found.path):
         return False
     units = {column_unit(name) for name in found.first_line}
     return any(map(is_time, found.first_line)) and all(units & of_role for of_role in _OF_A_RECORD)

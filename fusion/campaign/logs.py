@@ -9,7 +9,7 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate, chain, count
@@ -40,6 +40,7 @@ from fusion.campaign.values import (
 )
 from fusion.common import Array, FusionError
 from fusion.results.progress import counted
+from interferometry.io import tables
 from interferometry.io.faults import (
     SENTINEL_MAGNITUDE,
     THOUSANDS,
@@ -50,28 +51,6 @@ from interferometry.io.faults import (
     raise_if_mostly_invalid,
 )
 from interferometry.io.spreadsheets import Cell, cell_text, is_workbook, read_cells
-from interferometry.io.tables import (
-    DELIMITERS,
-    NO_ZONE,
-    BadReading,
-    DateOrder,
-    DelimitedTable,
-    counted_on,
-    decode_text,
-    delimiter_of,
-    delimiter_of_values,
-    describe_time_zone,
-    elapsed_s,
-    fields_of,
-    find_header,
-    parse_time,
-    raise_if_too_wide,
-    read_table,
-    read_timed_rows,
-    shown,
-    where_clock_goes_back,
-    zone_of,
-)
 from thermofuse.resources import by_word, vocabulary
 from thermofuse.units import find_unit
 
@@ -209,7 +188,7 @@ def read_drivers(path: str | Path, layout: LoggedTable | None = None) -> xr.Data
 
 def _read_log(path: Path, layout: LoggedTable | None = None) -> xr.Dataset:
     """Read a table of columns over time, each in its own unit."""
-    table = read_table(path, ("time",)) if layout is None else _laid_out(path, layout)
+    table = tables.read_table(path, ("time",)) if layout is None else _laid_out(path, layout)
     headings = {column: split_heading(path, column) for column in table.columns if column != "time"}
     if not headings:
         raise TableError(
@@ -220,17 +199,17 @@ def _read_log(path: Path, layout: LoggedTable | None = None) -> xr.Dataset:
     if repeated:
         raise TableError(f"{path}: more than one column is named {', '.join(repeated)}; give each its own name")
     variables = {name: {"units": unit, "long_name": name} for name, unit in headings.values()}
-    return read_timed_rows(
+    return tables.read_timed_rows(
         table, variables, lambda fields: [table.numerals.number(fields[column]) for column in headings]
     )
 
 
-def _laid_out(path: Path, layout: LoggedTable) -> DelimitedTable:
+def _laid_out(path: Path, layout: LoggedTable) -> tables.DelimitedTable:
     """Return a table as a campaign file describes it, with the headings and times that it would have if it said everything itself."""
     rows = read_rows(path, sheet=layout.sheet, header=layout.header_rows, missing=layout.missing)
     named = layout.time or (() if layout.every_s is not None else ("time",))
     time, reference, _ = read_times(path, rows, layout, named)
-    zone = "" if reference == NO_ZONE else "Z"
+    zone = "" if reference == tables.NO_ZONE else "Z"
     written = [f"{stamp}{zone}" for stamp in np.datetime_as_string(time, unit="us")]
     others = [str(name) for name in rows.frame.columns if name not in named]
     used = match_columns(layout.columns, others) if layout.columns else others
@@ -246,7 +225,7 @@ def _laid_out(path: Path, layout: LoggedTable) -> DelimitedTable:
     lines = [
         (int(line), [stamp, *fields]) for line, stamp, fields in zip(rows.frame.index, written, texts, strict=True)
     ]
-    return DelimitedTable(path, ("time", *headings), lines, Numerals.of_columns(zip(*texts, strict=True)))
+    return tables.DelimitedTable(path, ("time", *headings), lines, Numerals.of_columns(zip(*texts, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +277,7 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         frame, time, held, without_number = _by_channel(path, frame, lines, lost, used, record.long)
         left_out += without_number
     keep = ~np.isnat(time)
-    goes_back = [] if record.long is not None else where_clock_goes_back(path, frame.index[keep], time[keep])
+    goes_back = [] if record.long is not None else tables.where_clock_goes_back(path, frame.index[keep], time[keep])
     order = np.argsort(time[keep], kind="stable")
 
     def block(role: str, unit: str | None) -> tuple[list[str], list[str], np.ndarray]:
@@ -442,13 +421,9 @@ def sheet_of(path: Path, name: str | None = None) -> tuple[str, list[tuple[int, 
     sheets = read_cells(path, as_stored=True)
     if name is not None and name not in sheets:
         raise TableError(f"{path}: there is no sheet {name!r}; the sheets are {', '.join(map(repr, sheets))}")
-    heads = {
-        one: [(line, [cell_text(cell) for cell in cells]) for line, cells in rows[:HEAD]]
-        for one, rows in sheets.items()
-    }
-    firsts = {
-        one: at for one, rows in heads.items() if (at := first_of_values(rows)) is not None and len(rows) > at + 1
-    }
+    heads = {one: [(line, [*map(cell_text, cells)]) for line, cells in rows[:HEAD]] for one, rows in sheets.items()}
+    places = {one: first_of_values(rows) for one, rows in heads.items()}
+    firsts = {one: at for one, at in places.items() if at is not None and at + 1 < len(heads[one])}
     used = name or next(iter(firsts or sheets))
     rows, times = sheets[used], [cells[0] for _, cells in sheets[used]]
     others = [] if name else [one for one in firsts if one != used]
@@ -479,10 +454,10 @@ def text_lines(path: Path, header: HeaderRows | None = None) -> list[str]:
     """Return the lines of a text, each with its end, and tabs between fields that spaces part; the rest of a line of headings that one of
     them breaks is empty.
     """
-    lines = list(io.StringIO(decode_text(path, path.read_bytes()), newline=None))
-    for delimiter in (*DELIMITERS, None):
-        raise_if_too_wide(path, lines, delimiter)
-    first, heading = find_header(lines)
+    lines = list(io.StringIO(tables.decode_text(path, path.read_bytes()), newline=None))
+    for delimiter in (*tables.DELIMITERS, None):
+        tables.raise_if_too_wide(path, lines, delimiter)
+    first, heading = tables.find_header(lines)
     if _OPEN_HEADING.search(heading):
         quotes = accumulate(line.count('"') for line in lines[first : first + _LONGEST_HEADER])
         end = next((k for k, number in enumerate(quotes, first + 1) if number % 2 == 0), first + 1)
@@ -549,8 +524,8 @@ def _tabulated(path: Path, lines: list[str], sample: list[str], header: HeaderRo
     for k in asked:
         if told[k] is None:
             raise LaserFormatError(
-                f"{path}, line {k + 1}: {shown([lines[k].strip()])} does not name the {width} columns of values below it; part names "
-                "and values by tabs or semicolons and give every name on this line, or write header_rows = "
+                f"{path}, line {k + 1}: {tables.shown([lines[k].strip()])} does not name the {width} columns of values below it; part "
+                "names and values by tabs or semicolons and give every name on this line, or write header_rows = "
                 f"{{values = {first + 1}}} in the campaign file, with which the columns are called by their numbers"
             )
     tabulated = []
@@ -567,18 +542,18 @@ def _read_text(path: Path, header: HeaderRows | None) -> Rows:
     """Read delimited text with the dialect that its header line, or without one its first line of values, shows."""
     lines = text_lines(path, header)
     if header is None:
-        before, _ = find_header(lines)
+        before, _ = tables.find_header(lines)
         header = HeaderRows(names=before + 1, values=before + 2)
     below = lines[header.values - 1 :]
     if header.names:
         names = "".join(lines[header.names - 1 : header.names])
         values = max(below[:_SAMPLE], key=len, default="")
-        delimiter = next((mark for mark in "\t;," if mark in values and mark in names), delimiter_of(names))
+        delimiter = next((mark for mark in "\t;," if mark in values and mark in names), tables.delimiter_of(names))
     else:
-        delimiter = delimiter_of_values("".join(below[:1]))
-        width = max((len(fields_of(line, delimiter)) for line in below), default=0)
+        delimiter = tables.delimiter_of_values("".join(below[:1]))
+        width = max((len(tables.fields_of(line, delimiter)) for line in below), default=0)
         names = (delimiter or " ").join(str(k + 1) for k in range(width))
-    decimal = Numerals.of(text for line in below[:_SAMPLE] for text in fields_of(line, delimiter)).decimal
+    decimal = Numerals.of(text for line in below[:_SAMPLE] for text in tables.fields_of(line, delimiter)).decimal
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pd.errors.ParserWarning)
         frame = pd.read_csv(
@@ -613,7 +588,7 @@ def _read_text(path: Path, header: HeaderRows | None) -> Rows:
         RejectedLine(path.name, int(numbers[k]) + header.values, f"{saw} fields", f"{due} were expected")
         for k, (due, saw) in skipped.items()
     ]
-    units = fields_of(lines[header.units - 1], delimiter) if header.units else []
+    units = tables.fields_of(lines[header.units - 1], delimiter) if header.units else []
     return _named(frame, header, units, left_out, lines[: (header.names or 1) - 1])
 
 
@@ -675,13 +650,10 @@ def _numbers_of_cells(path: Path, rows: Rows) -> Rows:
         sample = texts[texts != ""].iloc[:_SAMPLE]
         if 2 * sum(map(has_unit, sample)) > len(sample):
             frame[name], in_cells[name] = _unit_in_cells(path, name, texts)
-    for name in frame.columns:
-        stated = {
-            "heading": name_and_unit(name)[1],
-            "row of units": rows.units.get(name, ""),
-            "cells": in_cells.get(name, ""),
-        }
-        known = {unit: place for place, text in stated.items() if (unit := find_unit(text)) is not None}
+    for name in map(str, frame.columns):
+        written = name_and_unit(name)[1], rows.units.get(name, ""), in_cells.get(name, "")
+        stated = zip(("heading", "row of units", "cells"), map(find_unit, written), strict=True)
+        known = {unit: place for place, unit in stated if unit is not None}
         if len(known) > 1:
             both = " and in ".join(f"{unit.name} by its {place}" for unit, place in known.items())
             raise TableError(f'{path}: the column "{name}" is in {both}; correct one of them')
@@ -690,7 +662,7 @@ def _numbers_of_cells(path: Path, rows: Rows) -> Rows:
 
 def _without_marks(path: Path, rows: Rows, missing: Sequence[float]) -> Rows:
     """Return rows without lines that sum the others up and marks for no reading, both named."""
-    frame, odd, summaries = rows.frame, dict[str, dict[int, str]](), dict[int, str]()
+    frame, odd, summaries = rows.frame, dict[str, list[RejectedLine]](), dict[int, str]()
     for name in map(str, frame.columns):
         cells, numbers = frame[name], numbers_in(frame[name])
         is_odd = np.isin(numbers, missing) | (np.abs(numbers) >= SENTINEL_MAGNITUDE)
@@ -701,39 +673,30 @@ def _without_marks(path: Path, rows: Rows, missing: Sequence[float]) -> Rows:
                 summaries |= dict(named) if len(named) <= min(_MOST_SUMMARIES, len(frame) / 10) else {}
                 continue
             is_odd |= np.isnan(numbers) & (texts != "").to_numpy()
-        if is_odd.any():
-            odd[name] = {
-                line: str(cell).strip() for line, cell in zip(cells.index[is_odd].tolist(), cells[is_odd], strict=True)
-            }
-            frame[name] = cells.mask(is_odd & np.isfinite(numbers))
-    _refuse_another_header(path, odd, rows.units, headings=frame.columns)
-    summaries |= {line: text for cells in odd.values() for line, text in cells.items() if _SUMMARY.search(text)}
-    marks = {
-        name: [
-            RejectedLine(path.name, line, text, f"is no reading of {name}")
-            for line, text in cells.items()
-            if not _SUMMARY.search(text)
+        found = zip(cells.index[is_odd].tolist(), cells[is_odd], strict=True)
+        odd[name] = [
+            RejectedLine(path.name, line, str(cell).strip(), f"is no reading of {name}") for line, cell in found
         ]
-        for name, cells in odd.items()
-    }
+        frame[name] = cells.mask(is_odd & np.isfinite(numbers)) if is_odd.any() else cells
+    _refuse_another_header(path, odd, rows.units)
+    summaries |= {one.line: one.value for cells in odd.values() for one in cells if _SUMMARY.search(one.value)}
+    marks = {name: [one for one in cells if not _SUMMARY.search(one.value)] for name, cells in odd.items()}
     left_out = [RejectedLine(path.name, line, text, "sums up other lines") for line, text in sorted(summaries.items())]
     return replace(rows, frame=frame.drop(index=list(summaries)), left_out=[*rows.left_out, *left_out], marks=marks)
 
 
-def _refuse_another_header(
-    path: Path, odd: Mapping[str, Mapping[int, str]], units: Mapping[str, str], *, headings: Collection[str]
-) -> None:
+def _refuse_another_header(path: Path, odd: Mapping[str, Sequence[RejectedLine]], units: Mapping[str, str]) -> None:
     """Refuse a line among the values whose cells head their columns anew, by other names or units."""
     of_units, anew = Counter[int](), dict[int, tuple[str, str, str]]()
     for name, cells in odd.items():
         known = units.get(name, "").strip("- ") or name_and_unit(name)[1]
-        for line, text in cells.items():
-            unit = name_and_unit(text)[1]
-            heads = (is_unit(unit) and unit != unit_name(known)) or (text != name and text in headings)
+        for one in cells:
+            unit, alone = name_and_unit(one.value)[1], is_unit(one.value)
+            heads = (is_unit(unit) and unit != unit_name(known)) or (one.value != name and one.value in odd)
             # A unit alone may be a state; a row of them heads what is below it.
-            of_units[line] += 2 if heads else is_unit(text) and text not in ("-", "1")
-            if heads or (known and is_unit(text) and unit_name(text) != unit_name(known)):
-                anew[line] = text, name, known
+            of_units[one.line] += 2 if heads else alone and one.value not in ("-", "1")
+            if heads or (known and alone and unit_name(one.value) != unit_name(known)):
+                anew[one.line] = one.value, name, known
     for line, (text, name, known) in anew.items():
         if of_units[line] > 1:
             raise TableError(
@@ -751,7 +714,7 @@ def _unit_in_cells(path: Path, name: str, texts: pd.Series) -> tuple[pd.Series, 
     values = []
     for line, part, unit in zip(texts.index, parts, written, strict=True):
         value, one = math.nan, find_unit(unit)
-        with suppress(BadReading):
+        with suppress(tables.BadReading):
             value = numerals.number(part[1]) if part else math.nan
         if unit != most and part and (one is None or whole is None or one.kind != whole.kind):
             raise TableError(f'{path}, line {line}: the column "{name}" is in {most}, here in {unit}; write one unit')
@@ -771,7 +734,7 @@ def numbers_in(column: pd.Series) -> np.ndarray:
     def number(text: str) -> float:
         try:
             return numerals.number(text)
-        except BadReading:
+        except tables.BadReading:
             return float("nan")
 
     return np.array([number(text) for text in texts])
@@ -876,22 +839,22 @@ def read_times(
     if record.time_format is not None:
         time, words = _formatted_times(path, texts, record)
     elif parts is not None:
-        time, words = parts.to_numpy("M8[ns]"), NO_ZONE
+        time, words = parts.to_numpy("M8[ns]"), tables.NO_ZONE
     elif np.isfinite(seconds).mean() > 0.5:
         time, words = _counted_times(path, seconds, rows, record, headings[0])
-    elif np.isfinite(elapsed := elapsed_s(texts)).mean() > 0.5:
+    elif np.isfinite(elapsed := tables.elapsed_s(texts)).mean() > 0.5:
         time, words = _after_start(elapsed, record, path)
     else:
         lines = [(int(line), text) for line, text in zip(frame.index, texts, strict=True)]
-        order = DateOrder(record.date_order) if record.date_order else DateOrder.of(path, lines)
+        order = tables.DateOrder(record.date_order) if record.date_order else tables.DateOrder.of(path, lines)
         time, zones = np.full(len(texts), np.datetime64("NaT", "ns")), dict[str, int]()
         for at, (line, text) in enumerate(lines):
-            with suppress(BadReading):
-                time[at], zone = parse_time(text, order)
+            with suppress(tables.BadReading):
+                time[at], zone = tables.parse_time(text, order)
                 zones.setdefault(zone, line)
-        words = describe_time_zone(path, zones) if zones else ""
+        words = tables.describe_time_zone(path, zones) if zones else ""
     for said in (" ".join(headings), *filter(_OF_ZONE.search, rows.above)):
-        if words == NO_ZONE and (zone := _zone_in(said)):
+        if words == tables.NO_ZONE and (zone := _zone_in(said)):
             time, words = from_zone(time, zone, file=path.name), f"converted to UTC from {zone}, as the heading says"
     same = np.flatnonzero(np.diff(time) == np.timedelta64(0)) + 1
     # What alone repeats a time, at the end, sums up the rows above it.
@@ -917,7 +880,7 @@ def _zone_in(heading: str) -> str:
     place = next((name for name in _PLACE.findall(heading) if name in available_timezones()), "")
     if _OF_ZONE.search(heading) and (bare := _OFFSET.search(heading)):
         return f"UTC{bare[1]}:{bare[2]}"
-    zone = "" if "offset" in heading.lower() else zone_of(heading)
+    zone = "" if "offset" in heading.lower() else tables.zone_of(heading)
     return f"UTC{zone[:3]}:{zone[3:]}" if zone else place
 
 
@@ -941,7 +904,7 @@ def _counted_times(
         )
     if unit in DAY_NUMBERS:
         # To the millisecond: in a day since the year 0 a double resolves 0.01 ms.
-        return _since(NO_START, np.round((counts - DAY_NUMBERS[unit]) * 86_400e3) / 1e3), NO_ZONE
+        return _since(NO_START, np.round((counts - DAY_NUMBERS[unit]) * 86_400e3) / 1e3), tables.NO_ZONE
     on, again = unwrapped(counts)
     time, words = _after_start(in_unit(on, unit, "s", column=heading, path=path), record, path)
     return time, words + again
@@ -951,7 +914,7 @@ def unwrapped(counts: np.ndarray) -> tuple[np.ndarray, str]:
     """Return the numbers of a counter of 16 or 32 bits that begins again at 0 as if it counted on, and that it did in words."""
     known = np.isfinite(counts)
     for bits in _COUNTERS:
-        on = counted_on(counts, 2.0**bits)
+        on = tables.counted_on(counts, 2.0**bits)
         steps = np.diff(on[known])
         over = steps[steps != np.diff(counts[known])]
         if over.size and steps.min() > 0.0 and over.max() <= _LARGEST_STEP * np.median(steps):
@@ -967,10 +930,10 @@ def _after_start(elapsed: np.ndarray, record: LoggedTable, path: Path) -> tuple[
     start, zone = NO_START, "+0000"
     if record.start is not None:
         try:
-            start, zone = parse_time(record.start)  # type: ignore[assignment]
-        except BadReading as fault:
+            start, zone = tables.parse_time(record.start)  # type: ignore[assignment]
+        except tables.BadReading as fault:
             raise TableError(f'start = "{record.start}": {fault.reason}, needed for {path}') from None
-    return _since(start, elapsed), describe_time_zone(path, {zone: 0})
+    return _since(start, elapsed), tables.describe_time_zone(path, {zone: 0})
 
 
 def _since(start: np.datetime64, elapsed: np.ndarray) -> np.ndarray:
@@ -991,12 +954,12 @@ def _formatted_times(path: Path, texts: pd.Series, record: LoggedTable) -> tuple
     except ValueError as error:
         raise TableError(f'{path}: time_format = "{form}": {error}; for example "%Y/%m/%d-%H:%M:%S"') from None
     if not set(re.findall(r"%-?([a-zA-Z])", form)) & set("dDjcxs"):
-        elapsed = elapsed_s(texts, of_minutes=form.startswith("%M"))
+        elapsed = tables.elapsed_s(texts, of_minutes=form.startswith("%M"))
         if np.isnan(elapsed).all():
-            elapsed = counted_on((times - times.dt.normalize()).dt.total_seconds().to_numpy("f8"), 86400.0)
+            elapsed = tables.counted_on((times - times.dt.normalize()).dt.total_seconds().to_numpy("f8"), 86400.0)
         return _after_start(elapsed, record, path)
     aware = times.dt.tz is not None
-    return times.dt.tz_localize(None).to_numpy("M8[ns]"), describe_time_zone(path, {"+0000" if aware else "": 0})
+    return times.dt.tz_localize(None).to_numpy("M8[ns]"), tables.describe_time_zone(path, {"+0000" if aware else "": 0})
 
 
 def in_unit(values: np.ndarray, unit: str, target: str, *, column: str, path: Path) -> np.ndarray:
@@ -1089,14 +1052,14 @@ def read_sensors(campaign: Campaign) -> ContactSensors | None:
 
 def _read_places(path: Path, names: list[str], size_mm: tuple[float, float]) -> dict[str, tuple[float, float]]:
     """Read ``name,x_mm,y_mm`` of every sensor, each on the plan."""
-    table = read_table(path, ("name", "x_mm", "y_mm"))
+    table = tables.read_table(path, ("name", "x_mm", "y_mm"))
     places: dict[str, tuple[float, float]] = {}
     for line, fields in table.records():
         if fields is None:
             raise TableError(f"{path}, line {line}: it does not have the fields of the heading; write name,x_mm,y_mm")
         try:
             place = (table.numerals.number(fields["x_mm"]), table.numerals.number(fields["y_mm"]))
-        except BadReading as fault:
+        except tables.BadReading as fault:
             raise TableError(f"{path}, line {line}: {fault.reason}; write the place in mm") from None
         if not (0.0 <= place[0] <= size_mm[0] and 0.0 <= place[1] <= size_mm[1]):
             raise TableError(
