@@ -534,7 +534,11 @@ def _times(rows: logs.Rows, keys: dict[str, Any], asked: dict[str, str]) -> tupl
                 return tuple(columns)
             asked.pop("date_order", None)
     # Times that are not understood are named.
-    places = [(samples[name][0], name, int(frame.index[frame[name].notna()][0])) for name in named if name in texts][:1]
+    places = [
+        (samples[name][0], name, int(frame.index[frame[name].notna()][0]))
+        for name in named
+        if name in texts and samples[name]
+    ][:1]
     told = [f'{text!r} in the column "{name}", line {line}, is no time that is read' for text, name, line in places]
     asked["every"] = "".join(told)
     return ()
