@@ -225,7 +225,7 @@ def test_every_notice_finds_its_words_and_gives_all_their_facts() -> None:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if (
                 isinstance(node, ast.Call)
-                and ast.unparse(node.func) == "Notice.of"
+                and ast.unparse(node.func) in ("Notice.of", "_notice")
                 and isinstance(node.args[0], ast.Constant)
             ):
                 name = str(node.args[0].value)
