@@ -774,23 +774,18 @@ def _coefficients(before: ComparedCampaign, after: ComparedCampaign) -> Iterator
         more = (", ".join(sorted(effects)).replace("_", " ") for effects in (first - second, second - first))
         yield Lack("effects", tuple(effects or "nothing more" for effects in more))
         return
-    found = [dict(_per_kelvin(loop)) for loop in models]
+    found = [_per_kelvin(loop) for loop in models]
     for name in found[0]:
         if name in found[1] and found[0][name].unit == found[1][name].unit:
             before_and_after = (Quantity(value=model[name].value, u=model[name].u) for model in found)
             yield _difference(name, "drift per kelvin", found[0][name].unit, *before_and_after, machine=True)
 
 
-def _per_kelvin(loop: AxisLoop) -> Iterator[tuple[str, Coefficient]]:
+def _per_kelvin(loop: AxisLoop) -> dict[str, Coefficient]:
     """The coefficients of a model that are per kelvin, by effect."""
-    for declared in loop.declared_coefficients:
-        if declared.unit.endswith("/K"):
-            wider = max(declared.u or 0.0, declared.jackknife_u or 0.0)
-            yield declared.effect, declared.model_copy(update={"u": wider or None})
-    for step in loop.steps:
-        for coefficient in step.coefficients[:1]:
-            if coefficient.unit.endswith("/K"):
-                yield step.effect, coefficient
+    found: list[tuple[str, Coefficient]] = [(one.effect, one) for one in loop.declared_coefficients]
+    found += [(step.effect, one) for step in loop.steps for one in step.coefficients[:1]]
+    return {effect: one for effect, one in found if one.unit.endswith("/K")}
 
 
 def _standard(before: ComparedCampaign, after: ComparedCampaign, common: Sequence[str]) -> Iterator[Change | Lack]:

@@ -100,8 +100,7 @@ def with_spread(entry: Mapping[str, Any]) -> dict[str, Any]:
         return dict(entry)
     # What was expected beforehand does not move.
     share = 1.0 if entry.get("prior") is None else max(0.0, 1.0 - (fitted / entry["prior_u"]) ** 2)
-    more = (share * moved) ** 2 - fitted**2
-    return {**entry, "u": float(np.hypot(entry["u"], np.sqrt(more)))} if more > 0.0 else dict(entry)
+    return {**entry, "u": float(np.sqrt(entry["u"] ** 2 + max(0.0, (share * moved) ** 2 - fitted**2)))}
 
 
 def scale_coefficients(

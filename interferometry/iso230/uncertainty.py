@@ -140,6 +140,9 @@ def _of_axis(result: xr.Dataset) -> dict[str, Sensitivities]:
         middle = result["mean_bidirectional"].values
         found["M"][0, :, np.nanargmax(middle)] += 0.5
         found["M"][0, :, np.nanargmin(middle)] -= 0.5
+        for name, wider in (("E", "M"), ("A", "E")):
+            # Where both extremes lie at one target, what distorts the axis between targets widens the range all the same.
+            found[name][0] += found[wider][0] if not found[name][0].sum(axis=0).any() else 0.0
         wide = result["repeatability_bidirectional"].values
         for name, values, quantity in (("B", np.abs(reversal), "reversal"), ("R", wide, "repeatability_bidirectional")):
             place = np.nanargmax(values)

@@ -245,6 +245,10 @@ def withhold_names(loop: Mapping[str, Any], effects: Mapping[str, Effect]) -> di
     structure_um = left["rms_um"] if left["shape"] and left["p_value"] < REMAINDER_LEVEL else 0.0
 
     def why(step: Mapping[str, Any]) -> str:
+        if step["effect"] in _SHAPED_AS_EXPANSION and math.isinf(alone_u):
+            return (
+                "beside it these readings do not tell the expansion of the axis, which looks alike along another line"
+            )
         if abs(off) > _LIMIT and (effects[step["effect"]].excited_by or step["effect"] in _SHAPED_AS_EXPANSION):
             return f"beside it the axis would expand by {alone:.3g} ± {alone_u:.2g} ppm/K, which the stated coefficient contradicts"
         if structure_um > step["rms_um"] and not {"time_s", "period_min"} & set(step["parameters"]):

@@ -28,21 +28,10 @@ from interferometry.drift.kalman import DriftModelError, DriftSystem, Order
 
 # How much drift there may be: the grids of drift variances over which a likelihood is maximised or drawn from.
 
-#: log10 factors on the variances of a common drift and of a stretch: as estimated, less of one or both, more of one or both.
-SHIFT_AND_STRETCH = (
-    (0.0, 0.0),
-    (-1.0, 0.0),
-    (-2.5, 0.0),
-    (0.0, -1.0),
-    (0.0, -2.5),
-    (-1.0, -1.0),
-    (-2.5, -2.5),
-    (-6.0, -6.0),
-    (0.5, 0.5),
-    (1.0, 0.0),
-    (0.0, 1.0),
-    (1.0, 1.0),
-)
+#: log10 factors on the variances of a common drift and, below, of a stretch: as estimated, less of one or both, more of one or both.
+_SHIFT = (0.0, -1.0, -2.5, 0.0, 0.0, -1.0, -2.5, -6.0, 0.5, 1.0, 0.0, 1.0)
+_STRETCH = (0.0, 0.0, 0.0, -1.0, -2.5, -1.0, -2.5, -6.0, 0.5, 0.0, 1.0, 1.0)
+SHIFT_AND_STRETCH = tuple(zip(_SHIFT, _STRETCH, strict=True))
 #: The same for the single drift of a channel.
 SINGLE = ((-6.0,), (-2.5,), (-1.0,), (0.0,), (0.5,), (1.0,))
 #: log10 factors among which the variances of simulated data are drawn.

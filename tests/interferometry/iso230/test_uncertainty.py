@@ -89,6 +89,15 @@ def test_scale_errors_enter_over_the_distance_as_the_product_rule_says():
     assert float(shares.sel(contributor="expansion_coefficient")) == pytest.approx(2.0 * 4.0 * 0.01)
 
 
+def test_what_distorts_the_axis_widens_a_range_whose_extremes_lie_at_one_target():
+    readings = np.tile([0.0, 0.1, 0.2, 0.3], (5, 2, 1))
+    readings[:, 0, 1] += [-3.0, 3.0, 0.0, 3.0, -3.0]
+    found = evaluate_iso230(test_made(readings), budget=Iso230Budget(device_ppm=10.0))
+    shares = found["contribution"].sel(contributor="device")
+    assert float(found["A"]) == pytest.approx(4.0 * 3.0 * np.sqrt(36.0 / 9.0 / 4.0), rel=0.01)
+    assert float(shares.sel(quantity="A")) == pytest.approx(float(shares.sel(quantity="E"))) != 0.0
+
+
 def test_contributions_add_up_to_the_uncertainty():
     rng = np.random.default_rng(3)
     result = evaluate_iso230(

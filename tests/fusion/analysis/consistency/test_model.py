@@ -281,6 +281,11 @@ def test_lines_that_fit_as_well_are_part_of_the_uncertainty_of_the_expansion() -
     assert with_line({**entry, "effect": "table_offset"}, far)["u"] == 0.5
 
 
+def test_a_shape_along_the_axis_is_withheld_where_the_expansion_beside_it_is_not_told() -> None:
+    loop = withhold_names(loop_with("unseen_heat_source", "pitch_error", **declared(11.5, math.inf)), library())
+    assert [bool(step["withheld"]) for step in loop["steps"]] == [False, True]
+
+
 @pytest.mark.parametrize(("value", "withheld"), [(11.5, False), (2.1, True)])
 def test_names_of_courses_and_shapes_are_withheld_where_the_expansion_contradicts(value: float, withheld: bool) -> None:
     names = ("unseen_heat_source", "angular_growth", "dead_path")
