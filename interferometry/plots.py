@@ -216,7 +216,7 @@ def plot_profile(deviations: xr.Dataset, estimated: xr.Dataset, ax: Axes | None 
 def plot_drift(
     deviations: xr.Dataset, estimated: xr.Dataset, ax: Axes | None = None, *, direction: str = "positive"
 ) -> Axes:
-    """Plot the drift of every position over time, from the first position (dark) to the last.
+    """Plot the drift of every position since the first cycle over time, from the first position (dark) to the last.
 
     Parameters
     ----------
@@ -257,12 +257,12 @@ def plot_drift(
     colours = mpl.colormaps[TIME_MAP](np.linspace(0.0, 0.95, ordered.sizes["target"]))
     ends = (0, ordered.sizes["target"] - 1)
     for k, colour in enumerate(colours):
-        here = ordered[["drift", "drift_u"]].sel(direction=direction).isel(target=k)
+        here = ordered.sel(direction=direction).isel(target=k)
         x = along.sel(direction=direction).isel(target=k)
-        ax.plot(x, here["drift"], color=colour, linewidth=1.0)
+        drift, band = here["drift_since_first"], 2 * here["drift_since_first_u"]
+        ax.plot(x, drift, color=colour, linewidth=1.0)
         if k in ends:
-            band = 2 * here["drift_u"]
-            ax.fill_between(x, here["drift"] - band, here["drift"] + band, color=colour, alpha=0.18, linewidth=0)
+            ax.fill_between(x, drift - band, drift + band, color=colour, alpha=0.18, linewidth=0)
     _colour_bar(ax, ordered["position"].values[[0, -1]], "position / mm")
     ax.set(xlabel=label, ylabel="drift / µm", title=ARROWS[direction])
     return ax

@@ -230,12 +230,18 @@ def _test(
                 name=one.name,
                 unit="degC" if one.unit == "K" else one.unit,
                 hours=tuple(np.round((seconds[::every] - seconds[0]) / 3600.0, 4).tolist()),
-                values=tuple(None if np.isnan(value) else round(value, 4) for value in one.values[::every].tolist()),
+                values=tuple(None if np.isnan(value) else round(value, 4) for value in shown[::every].tolist()),
             )
             for one in (*courses, *sensors)
+            for shown in [one.values if one.unit == "K" else one.values - _first(one.values)]
         ),
         remarks=(*remarks, *DEFINITIONS),
     )
+
+
+def _first(values: Array) -> float:
+    """Return the first value that is known."""
+    return float(next(iter(values[np.isfinite(values)]), np.nan))
 
 
 def _budget(course: _Course, size: float, excess: float) -> list[tuple[str, float | None, str]]:

@@ -584,7 +584,7 @@ class ThermalCourse(ResultPart):
     hours: tuple[float, ...]
     """Time since the start of the test, h."""
     values: tuple[Number, ...]
-    """Values."""
+    """Temperatures; of everything else the change since the first value."""
 
 
 class ThermalDistortion(ResultPart):

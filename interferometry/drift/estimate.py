@@ -178,7 +178,8 @@ def estimate_drift(
         - ``scatter`` (direction, target): random standard deviation, with u and ``scatter_freedom`` (1), its degrees of
           freedom; ``scatter_position`` (target): both directions together; ``sigma``: of an ordinary reading.
         - ``drift`` (cycle, direction, target) from the stated thermal state at every reading, with u, and every component as
-          ``drift_<component>``, with u: profile plus drift is the expected reading. ``drift_size`` (component): standard
+          ``drift_<component>``, with u: profile plus drift is the expected reading. ``drift_since_first``, with u: the same from the
+          mean state of the first cycle, where it is zero. ``drift_size`` (component): standard
           deviation over the test; ``drift_rate`` (component): standard deviation of the increments of one hour;
           ``drift_share`` (component, direction, target; 1): its share in a reading.
         - ``noise`` (cycle, direction, target): estimated random part of each reading. ``standardised`` (1): its deletion
@@ -508,9 +509,11 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     """Return the joint estimate as a Dataset; see `estimate_drift`."""
     fit, grid = joint.fit, _Grid(deviations, joint)
     smoothed = fit.system.smooth(fit.residual()[:, None])
-    weights = state_weights(fit.system.seconds, joint.readings["cycle"].values, state)
-    at_state = _drift_at_state(joint, weights)
+    cycle = joint.readings["cycle"].values
+    at_state = _drift_at_state(joint, state_weights(fit.system.seconds, cycle, state))
     drift, covariance, by_coefficients = _drift_from_state(joint, smoothed, at_state)
+    in_first = cycle == cycle[0]
+    since_first = _drift_from_state(joint, smoothed, _drift_at_state(joint, in_first / np.count_nonzero(in_first)))
     resolution_um = float(joint.readings["resolution"])
     deletion = fit.deletion_residuals(ROUNDING * resolution_um)
     scatter, freedom = _scatter(joint, smoothed, by_coefficients, deletion)
@@ -518,18 +521,19 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     standardised[grid.is_left_out(deviations)] = np.inf
     noise = fit.system.independent * smoothed.u[:, 0]
     excess = _excess_variance(scatter, freedom, joint) + _memory_variance(grid.per_reading(noise), joint)
-    loadings = fit.system.loadings
-    drift_variance = np.einsum("kc,kce,ke->k", loadings, covariance, loadings)
-    target = joint.cells[joint.cell, 1]
-    for square in drift[:, drift.shape[1] - joint.shapes.shape[1] :].T ** 2:
-        # A shape comes from the readings of its target, and is as uncertain as they are.
-        drift_variance += fit.sigma**2 * square / np.bincount(target, square)[target]
+    # A shape comes from the readings of its target, and is as uncertain as they are.
+    target, shapes = joint.cells[joint.cell, 1], drift[:, drift.shape[1] - joint.shapes.shape[1] :]
+    shape_variance = [fit.sigma**2 / np.bincount(target, square)[target] for square in shapes.T**2]
     result = xr.Dataset(
         {
             **_profile_variables(grid, joint, deviations, at_state, excess),
             **_scatter_variables(grid, joint, scatter, freedom),
-            "drift": _um(DIMS, grid.per_reading(np.einsum("kc,kc->k", loadings, drift)), "drift from the stated state"),
-            "drift_u": _um(DIMS, grid.per_reading(np.sqrt(np.maximum(drift_variance, 0.0)))),
+            **_drift_variables(
+                grid, joint, drift, covariance, shape_variance, ("drift", "drift from the stated state")
+            ),
+            **_drift_variables(
+                grid, joint, *since_first[:2], shape_variance, ("drift_since_first", "drift since the first cycle")
+            ),
             "noise": _um(DIMS, grid.per_reading(noise), "random part of the reading"),
             "standardised": (DIMS, standardised, {"units": "1"}),
             "sigma": _um((), fit.sigma),
@@ -545,6 +549,25 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
         scatter_undetermined=int(fit.noise_hidden),
     )
     return result
+
+
+def _drift_variables(
+    grid: _Grid,
+    joint: JointFit,
+    drift: Array,
+    covariance: Array,
+    shape_variance: Sequence[Array],
+    names: tuple[str, str],
+) -> Variables:
+    """Return the drift of every reading from one thermal state, by its name and in words, with its uncertainty."""
+    loadings, (name, words) = joint.fit.system.loadings, names
+    variance = np.einsum("kc,kce,ke->k", loadings, covariance, loadings)
+    for size, of_shape in zip(drift.T[drift.shape[1] - len(shape_variance) :], shape_variance, strict=True):
+        variance += size**2 * of_shape
+    return {
+        name: _um(DIMS, grid.per_reading(np.einsum("kc,kc->k", loadings, drift)), words),
+        f"{name}_u": _um(DIMS, grid.per_reading(np.sqrt(np.maximum(variance, 0.0)))),
+    }
 
 
 def _profile_variables(

@@ -52,7 +52,7 @@ def test_profile_and_drift_are_those_of_the_estimate(rng: np.random.Generator) -
     assert np.asarray(profile.get_ydata()) == pytest.approx(estimated["profile"].values[0])
     ax = plots.plot_drift(deviations, estimated, direction="negative")
     assert len(ax.lines) == 16 and len(ax.collections) == 2
-    assert np.asarray(ax.lines[5].get_ydata()) == pytest.approx(estimated["drift"].values[:, 1, 5])
+    assert np.asarray(ax.lines[5].get_ydata()) == pytest.approx(estimated["drift_since_first"].values[:, 1, 5])
     assert len(plots.plot_position(deviations, estimated, target=2).collections) == 2
 
 

@@ -293,7 +293,7 @@ def plot_drift_temperature(fused: xr.Dataset, drift: xr.Dataset) -> Chart:
     order = np.argsort(fused["position"].values, kind="stable")
     place = fused["position"].values[order].astype(float)
     rise = fused["local_rise"].mean("direction").transpose("target", "cycle").values[order]
-    moved = drift["drift"].mean("direction").transpose("target", "cycle").values[order]
+    moved = drift["drift_since_first"].mean("direction").transpose("target", "cycle").values[order]
     drawn = new_figure(x="rise at the position / K", y="drift / µm", height=360, zero=True)
     add_ordered_lines(drawn, list(rise), list(moved), place, "position / mm")
     valid = np.isfinite(rise) & np.isfinite(moved)

@@ -44,8 +44,8 @@ from interferometry.plots import ACCENT, ARROWS, COLOURS, INK, MUTED, hours_sinc
 def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
     """Draw the drift of every position over time, mean of both approaches; the ends of the axis are named and have their 95 % band."""
     hours = hours_since_start(deviations).mean("direction").transpose("cycle", "target").values
-    lines = drift["drift"].mean("direction").transpose("cycle", "target").values
-    band = 2 * drift["drift_u"].mean("direction").transpose("cycle", "target").values
+    lines = drift["drift_since_first"].mean("direction").transpose("cycle", "target").values
+    band = 2 * drift["drift_since_first_u"].mean("direction").transpose("cycle", "target").values
     position = deviations["position"].values
     order = np.argsort(position, kind="stable")
     colours = ordered_colours(position.size)
@@ -133,7 +133,7 @@ def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Se
 
 def plot_drift_map(drift: xr.Dataset, position: xr.DataArray) -> Chart:
     """Draw the drift as colours over cycle and position, mean of both approaches."""
-    return cycle_map(drift["drift"].mean("direction"), position, "drift / µm")
+    return cycle_map(drift["drift_since_first"].mean("direction"), position, "drift / µm")
 
 
 def cycle_map(values: xr.DataArray, position: xr.DataArray, label: str) -> Chart:

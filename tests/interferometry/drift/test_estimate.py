@@ -78,6 +78,17 @@ def test_the_stated_state_is_where_drift_is_zero(of_states):
 
 
 @pytest.mark.slow
+def test_the_drift_since_the_first_cycle_is_zero_there_and_moves_as_the_drift_does(rng):
+    deviations, _ = simulate(rng, cycles=12)
+    estimated = estimate_drift(deviations)
+    since, drift = (estimated[name].values for name in ("drift_since_first", "drift"))
+    assert np.diff(since, axis=0) == pytest.approx(np.diff(drift, axis=0))
+    # Both approaches of a position lie about the middle of the cycle, where a slow drift is its mean.
+    assert np.abs(since[0].mean(axis=0)).max() < 0.05 * np.ptp(since, axis=0).min()
+    u = estimated["drift_since_first_u"].values
+    assert u[0].max() < u[1:].min()
+
+
 def test_the_state_at_the_start_of_a_steep_warm_up_is_within_its_bands():
     inside = []
     for seed in range(10):

@@ -37,8 +37,8 @@ def still_readings():
     coords = {"cycle": cycle, "direction": direction, "target": target}
     drift = xr.Dataset(
         {
-            "drift": (dims, value),
-            "drift_u": (dims, np.full((3, 2, 2), 0.1)),
+            "drift_since_first": (dims, value),
+            "drift_since_first_u": (dims, np.full((3, 2, 2), 0.1)),
             "profile": (("direction", "target"), [[4.0, 0.0], [3.0, -1.0]]),
             "profile_u": (("direction", "target"), np.full((2, 2), 0.25)),
         },
@@ -62,9 +62,9 @@ def test_drift_of_every_position(still_readings):
 
 def test_a_first_cycle_and_a_position_without_drift_are_left_out_of_the_sentence(still_readings):
     drift, deviations = (one.copy(deep=True) for one in still_readings)
-    drift["drift"][{"cycle": 0}] = np.nan
-    drift["drift"][{"target": 1}] = np.nan
-    mean = drift["drift"].mean("direction")
+    drift["drift_since_first"][{"cycle": 0}] = np.nan
+    drift["drift_since_first"][{"target": 1}] = np.nan
+    mean = drift["drift_since_first"].mean("direction")
     change = float((mean.isel(cycle=-1) - mean.isel(cycle=1)).mean())
     assert f"it changes by {number(change, 2)} µm on average" in plot_drift(drift, deviations).seen
 
