@@ -95,6 +95,11 @@ def link(text: str, address: str) -> pn.pane.HTML:
     return markup(f'<p><a href="{as_markup(address)}" target="_blank" rel="noopener">{as_markup(text)}</a></p>')
 
 
+def frame(title: str, address: str) -> pn.pane.HTML:
+    """Return another page of the application within this one, as high as the window."""
+    return markup(f'<iframe title="{as_markup(title)}" src="{as_markup(address)}"></iframe>')
+
+
 def switched(
     label: str, builders: Mapping[str, Callable[[], Any]], first: str, *, menu: bool = False
 ) -> tuple[pn.widgets.RadioButtonGroup | pn.widgets.Select, pn.Column]:

@@ -14,19 +14,23 @@ from typing import Any
 from fusion.common import FusionError
 from fusion.pipeline.workers import start_run
 from fusion.results.numbers import duration
+from fusion.results.progress import time_left_s
 
 # How far a run is, stage by stage, and how long the present one still takes.
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of a run: finished parts `done` of `total`; times in s, of any clock that only advances."""
+    """One step of a run: finished parts `done` of `total`; times in s, of any clock that only advances; `first` parts and when they were
+    finished.
+    """
 
     label: str
     done: int
     total: int
     started_s: float
     now_s: float
+    first: tuple[int, float] | None = None
 
     @property
     def share(self) -> float:
@@ -41,8 +45,8 @@ class Stage:
             return f"done in {duration(elapsed)}" if elapsed >= 1.0 else "done"
         if self.done == 0:
             return "under way"
-        left = elapsed / self.done * (self.total - self.done)
-        return f"{self.done} of {self.total}, about {duration(max(left, 1.0))} left"
+        left = None if self.first is None else time_left_s(self.first, self.done, self.total, self.now_s)
+        return f"{self.done} of {self.total}" + ("" if left is None else f", about {duration(max(left, 1.0))} left")
 
 
 @dataclass
@@ -54,8 +58,10 @@ class Progress:
     def take(self, label: str, done: int, total: int, now_s: float) -> None:
         """Note that a step is so far."""
         known = self.stages.get(label)
-        begun = now_s if known is None or done < known.done else known.started_s
-        self.stages[label] = Stage(label, done, total, begun, now_s)
+        if known is None or done < known.done:
+            known = Stage(label, 0, total, now_s, now_s)
+        first = known.first or ((done, now_s) if done else None)
+        self.stages[label] = Stage(label, done, total, known.started_s, now_s, first)
 
 
 #: Seconds that a run has to end when the application does.

@@ -85,6 +85,19 @@ def listed(names: Iterable[str]) -> str:
 Report = Callable[[str, int, int], None]
 
 _SECONDS_BETWEEN_LINES = 10.0
+#: Share of the parts of a step after which its speed is known.
+_PACED = 0.05
+
+
+def time_left_s(first: tuple[int, float], done: int, total: int, now_s: float) -> float | None:
+    """Return the time that is left at the speed since the first parts, ``(parts, s)``, were reported, which wait for all that a step has to
+    start; None where too few followed.
+    """
+    parts, since_s = first
+    followed = done - parts
+    return (now_s - since_s) / followed * (total - done) if followed >= max(1, _PACED * total) else None
+
+
 #: A step is overdue after this multiple of its forecast, of one without parts: of what the run took before it; and after a minute.
 _OVERDUE, _LEAST_OVERDUE_S = 10.0, 60.0
 _BY_PARTS, _BY_RUN = "{:.0f} s were expected from its first parts", "the whole run before it took {:.0f} s"
@@ -110,6 +123,7 @@ class Reporter(AbstractContextManager["Reporter"]):
         self._tasks: dict[str, object] = {}
         self._started: dict[str, float] = {}
         self._spoken: dict[str, float] = {}
+        self._first: dict[str, tuple[int, float]] = {}
         self._finished: set[str] = set()
         self._running: dict[str, tuple[float, float, str]] = {}
         self._begun = time.monotonic()
@@ -176,17 +190,20 @@ class Reporter(AbstractContextManager["Reporter"]):
             if done >= total:
                 return
             self._finished.remove(label)
-            del self._started[label]
+            del self._started[label], self._first[label]
         if label not in self._started:
             self._started[label] = self._spoken[label] = now
             if done < total:
                 self._console.print(f"{label} ...", highlight=False)
                 return
+        if done:
+            self._first.setdefault(label, (done, now))
         if done >= total:
             self._finished.add(label)
+            self._first.setdefault(label, (done, now))
             self._console.print(f"{label}: done in {now - self._started[label]:.1f} s", highlight=False)
         elif now - self._spoken[label] > _SECONDS_BETWEEN_LINES:
             self._spoken[label] = now
-            left_s = (now - self._started[label]) / done * (total - done) if done else 0.0
-            left = f", about {left_s:.0f} s left" if left_s else ""
+            left_s = time_left_s(self._first[label], done, total, now) if done else None
+            left = "" if left_s is None else f", about {left_s:.0f} s left"
             self._console.print(f"{label}: {done} of {total}{left}", highlight=False)

@@ -25,8 +25,7 @@ from typer.testing import CliRunner
 
 from fusion import cli
 from fusion.app.parts import State
-from fusion.app.results.charts import loop_steps
-from fusion.app.results.data import Linker, Products, Selection
+from fusion.app.results.data import Products
 from fusion.app.results.screen import results_screen
 from fusion.app.setup.screen import SetUpScreen
 from fusion.campaign.config import load_campaign
@@ -34,6 +33,7 @@ from fusion.pipeline.fleet import find_members
 from fusion.report.exports.controls import emit
 from fusion.report.fleet import Row, as_csv, render_fleet, with_findings, write_book
 from fusion.results.recursion import read_recursion
+from fusion.results.store import read_product
 from tests.fusion.app.texts import texts
 from tests.fusion.campaign_parts import change, simulated
 
@@ -252,9 +252,6 @@ def test_exports_of_a_record_hold_every_name_once_and_no_formula(record: Path, t
 
 
 def test_the_screens_of_a_record_hold_every_name_and_write_them_again(record: Path, tmp_path: Path) -> None:
-    products = Products(record)
-    linker = Linker(Selection(), [], products.cycles, None)
-    assert loop_steps(products, linker)
     state = State(root=record.parent, results=record)
     assert TITLE.strip() in texts([results_screen(state)])
     shutil.copy(record.parent / "rec [1] #.csv", tmp_path)
@@ -327,8 +324,7 @@ def test_a_report_of_an_axis_holds_every_name_as_text(axis: Path) -> None:
 
 
 def test_drivers_of_an_axis_keep_their_names_in_the_product(axis: Path) -> None:
-    fused = Products(axis).fusion
-    assert fused is not None
+    fused = read_product(axis, "fusion")
     assert not missing([name for name in (*FIDUCIALS, *DRIVERS) if "/" not in name], "\n".join(map(str, fused)))
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import panel as pn
@@ -17,26 +15,12 @@ from fusion.app import parts as ui
 from fusion.app.drawings import keep_scale, shown_drawing
 from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Products, Selection
 from fusion.campaign.inputs import lacks_course
-from fusion.report.campaign import (
-    DECIDED_BEFORE,
-    describe_anomaly,
-    describe_candidates,
-    describe_model,
-    errors_table,
-    shown_channels,
-    steps_table,
-)
 from fusion.report.charts import readings
 from fusion.report.charts.plan import Layer, add_marks, draw_followed, draw_map, draw_places, extent_of
-from fusion.report.charts.readings import cycle_map
-from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_series, new_figure, of_rank, palette
-from fusion.report.findings import action, next_steps, step_phrase
-from fusion.report.wording import Table, anomaly_figures, caption, conditional, effect_words, iso230_values, say
-from fusion.results.axis import AnomalyPart
-from fusion.results.loop import AxisLoop, RecordLoop
-from fusion.results.numbers import join, moment, number, p_words, place
-from fusion.results.store import DamagedProductError, group, has
+from fusion.report.wording import Table, caption, iso230_values, say
+from fusion.results.numbers import moment, number, place
+from fusion.results.store import group, has
 from interferometry.plots import ACCENT, hours_since_start
 
 
@@ -92,7 +76,7 @@ def _drift_charts(
 
 def _highlight(read: xr.Dataset, joint: xr.Dataset, selection: Selection, course: Chart) -> None:
     """Draw the drift of the chosen position over the others."""
-    hours, lines = hours_since_start(read).mean("direction"), joint["drift"].mean("direction")
+    hours, lines = hours_since_start(read).mean("direction"), joint["drift_since_first"].mean("direction")
 
     def data() -> dict[str, np.ndarray]:
         return {"x": hours.sel(target=selection.target).values, "y": lines.sel(target=selection.target).values}
@@ -142,110 +126,9 @@ def _standard_charts(read: xr.Dataset, products: Products, linker: Linker) -> ui
     return parts
 
 
-# The closed loop step by step: residual before, scores of the candidates, effect added, residual after.
-
-
 def table_of(shown_table: Table, caption: str) -> pn.viewable.Viewable:
     """Return a table of the report."""
     return ui.table(shown_table.titles, [row.cells for row in shown_table.rows], caption=caption)
-
-
-def loop_steps(products: Products, linker: Linker) -> ui.Parts:
-    """Return the closed loop of a run that has one step by step, in the words of the report."""
-    results = products.results
-    loop = results.loop
-    assert loop is not None
-    answers = {"How sure": say("how_sure", results), "What remains": say("what_remains", results)}
-    parts = [
-        *(ui.paragraph(f"{question}: {text}") for question, text in answers.items() if text),
-        table_of(errors_table(loop), "Errors of predicting what was held out"),
-        ui.note(DECIDED_BEFORE),
-    ]
-    if isinstance(loop, RecordLoop):
-        parts += [ui.heading("Steps", level=3), table_of(steps_table(loop), "Declared model and added effects")]
-        parts += [] if products.fusion is None else record_charts(products.fusion)
-    else:
-        caption = "Coefficients, what was not tried and not admitted"
-        numbers = ui.table(("Coefficient", "Value (k = 2)"), describe_model(loop), caption=caption)
-        parts += [*_rounds(products, loop, linker), ui.heading("The model in numbers", level=3), numbers]
-    return [*parts, ui.heading("What to do next", level=3), *(ui.paragraph(step) for step in next_steps(results)[:6])]
-
-
-def record_charts(record: xr.Dataset) -> ui.Parts:
-    """Return the charts of a record, and those of the displacement that a menu chooses; first the one that moves most."""
-    charts, of_each = draw_record(record), ("prediction", "residual", "contribution")
-
-    def of(channel: int) -> pn.viewable.Viewable:
-        drawn = [f"{name}_{channel}" for name in of_each if f"{name}_{channel}" in charts]
-        return ui.column(*(shown(charts[name], caption(name)) for name in drawn))
-
-    names = list(shown_channels(record))
-    moved = np.ptp(np.nan_to_num(record["displacement"].sel(channel=names).transpose("channel", ...).values), axis=1)
-    builders = {name: partial(of, k) for k, name in enumerate(names)}
-    menu, chosen = ui.switched("Displacement", builders, names[int(moved.argmax())], menu=True)
-    common = [shown(chart, caption(name)) for name, chart in charts.items() if not name.startswith(of_each)]
-    return [menu, chosen, *common]
-
-
-def _require_same_run(products: Products, loop: AxisLoop, stored: xr.Dataset) -> None:
-    """Refuse a fusion.nc whose last effects are not the steps of results.json."""
-    # An effect that entered more than once has its place behind its name.
-    kept = [re.sub(r" \d+$", "", str(name)) for name in stored["effect"].values]
-    steps = [step.effect for step in loop.steps]
-    if len(kept) < len(steps) or kept[len(kept) - len(steps) :] != steps:
-        raise DamagedProductError(
-            f"{products.folder / 'fusion.nc'}: its effects are not the steps of results.json; put the files of one run back, or run the "
-            "campaign again"
-        )
-
-
-def _rounds(products: Products, loop: AxisLoop, linker: Linker) -> ui.Parts:
-    """Every round of the search: what was left, who was tried, what entered."""
-    stored, read, time = products.loop, products.deviations, products.results.time
-
-    def linked_map(values: xr.DataArray, label: str, caption: str) -> pn.viewable.Viewable:
-        """A map of cycle and position, each position about its mean."""
-        assert read is not None
-        about = values.mean("direction")
-        chart = cycle_map(about - about.mean("cycle"), read["position"], f"{label} / µm")
-        linker.link(chart.figure, x=CYCLE, y=POSITION)
-        return shown(chart, f"{caption}. A click chooses cycle and position.")
-
-    if stored is not None:
-        _require_same_run(products, loop, stored)
-    parts: ui.Parts = []
-    candidates = describe_candidates(loop)
-    for entered in range(max(len(loop.steps) + 1, len(loop.search))):
-        turn, later = entered + 1, loop.steps[entered:]
-        parts.append(ui.heading(f"Round {turn}", level=3))
-        if stored is not None and entered <= len(loop.steps):
-            names = join([effect_words(step.effect).name for step in later])
-            left = f"Residual before this round: that of the final model with {names} put back, each position about its mean"
-            left = left if later else "What the final model leaves"
-            parts.append(linked_map(effects_left(stored, loop, entered), "residual", left))
-        scores = [row.cells[1:] for row in candidates.rows if row.cells[0] == str(turn)]
-        if scores:
-            caption = f"Best candidate of every effect in round {turn}, gains in log-likelihood"
-            parts.append(ui.table(candidates.titles[1:], scores, caption=caption))
-        if not later:
-            parts.append(ui.paragraph("No further effect entered."))
-            continue
-        step = later[0]
-        phrase = f"{step_phrase(step, time, record=False)}, {p_words(step.p_value)}; {say('step_errors', step)}"
-        entry = f"Entered, {say('doubt', step)}" if step.doubt else "Entered"
-        parts.append(ui.paragraph(f"{entry}: {phrase}. {action(step, time, record=False)}"))
-        if stored is not None:
-            part = stored["contribution"].isel(effect=stored.sizes["effect"] - len(later)).drop_vars("effect")
-            added = f"Added: {effect_words(step.effect).name}, {number(step.rms_um, 2)} µm rms, each position about its mean"
-            parts.append(linked_map(part, "contribution", added))
-    return parts
-
-
-def effects_left(stored: xr.Dataset, loop: AxisLoop, entered: int) -> xr.DataArray:
-    """Return the residual of the final model with the effects that had not entered yet put back (cycle, direction, target), um."""
-    first = stored.sizes["effect"] - len(loop.steps) + entered
-    later = stored["contribution"].isel(effect=slice(first, None))
-    return stored["residual_final"] + later.sum("effect", skipna=False)
 
 
 # The thermal map with its cycles, and the temperature of chosen places over time.
@@ -425,36 +308,3 @@ class ThermalView:
 def to_scale(drawn: figure) -> None:
     """Show a map of the report to scale in whatever width the page has."""
     keep_scale(drawn, *((ends.start, ends.end) for ends in (drawn.x_range, drawn.y_range)))
-
-
-# Positions that stand out, as cards below the scatter of every position.
-
-
-def anomaly_cards(products: Products, selection: Selection) -> ui.Parts:
-    """Return the scatter of every position and a card for each that stands out, or say that there is none."""
-    anomalies = products.results.anomalies or ()
-    if not anomalies:
-        return [ui.paragraph("No position stands out from the others, at a family-wise error of 5 %.")]
-    cards: ui.Parts = [_card(products, selection, anomaly) for anomaly in anomalies]
-    if products.deviations is None or products.drift is None:
-        return cards
-    flagged = {anomaly.target for anomaly in anomalies}
-    scatter = readings.plot_position_scatter(products.drift, products.deviations["position"], flagged)
-    return [shown(scatter, caption("anomalies")), *cards]
-
-
-def _card(products: Products, selection: Selection, anomaly: AnomalyPart) -> pn.viewable.Viewable:
-    """Return what stands out, what it rests on, and what to inspect."""
-    told = describe_anomaly(anomaly)
-    sentence = conditional(told["sentence"], products.results.inputs, *anomaly_figures(anomaly))
-    show = pn.widgets.Button(label=f"Show position {anomaly.target} everywhere")
-    show.on_click(lambda event: selection.param.update(target=anomaly.target))
-    parts = [
-        ui.heading(told["title"], level=3),
-        ui.paragraph(f"{sentence} It stands out by {told['stands_out']}."),
-        *([ui.paragraph("For:"), ui.bullets(told["support"])] if told["support"] else []),
-        *([ui.paragraph("Against:"), ui.bullets(told["against"])] if told["against"] else []),
-        ui.paragraph(f"What to inspect: {told['check']}"),
-        show,
-    ]
-    return ui.column(*parts)

@@ -16,7 +16,6 @@ from bokeh.plotting import figure
 
 from fusion.app.parts import schedule_update
 from fusion.report.charts.plan import LAYERS, Layer, scale_of
-from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
 from fusion.results.store import group, has, open_in_file, read_json_object, read_product, require_kind, require_own
 from interferometry.plots import ACCENT
@@ -56,11 +55,6 @@ class Products:
         return require_kind(open_in_file(path), "fields", path)
 
     @cached_property
-    def thermograms(self) -> xr.Dataset | None:
-        """Content of thermograms.nc; None where no camera measured alone."""
-        return read_product(self.folder, "thermograms") if (self.folder / "thermograms.nc").is_file() else None
-
-    @cached_property
     def deviations(self) -> xr.Dataset | None:
         """Content of deviations.nc; None without a laser."""
         return read_product(self.folder, "deviations") if (self.folder / "deviations.nc").is_file() else None
@@ -70,20 +64,6 @@ class Products:
         """The joint estimate of profile and drift; None where the readings have no times, or there are none."""
         read = self.deviations
         return group(read, "drift") if read is not None and has(read, "drift") else None
-
-    @cached_property
-    def fusion(self) -> xr.Dataset | None:
-        """Root of fusion.nc; None where a run has none."""
-        kind = "record" if isinstance(self.results.loop, RecordLoop) else "fusion"
-        return read_product(self.folder, kind) if (self.folder / "fusion.nc").is_file() else None
-
-    @cached_property
-    def loop(self) -> xr.Dataset | None:
-        """The closed loop of an axis; None of a record, and where there was no model."""
-        root = self.fusion
-        if root is None or isinstance(self.results.loop, RecordLoop) or not has(root, "loop"):
-            return None
-        return group(root, "loop")
 
     @property
     def layers(self) -> list[Layer]:

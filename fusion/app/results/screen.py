@@ -11,17 +11,14 @@ from pathlib import Path
 import panel as pn
 
 from fusion.app import parts as ui
-from fusion.app.results.charts import ThermalView, anomaly_cards, laser_charts, loop_steps, reading_hours
+from fusion.app.results.charts import ThermalView, laser_charts, reading_hours
 from fusion.app.results.data import Linker, Products, Selection
 from fusion.common import FusionError, versions
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
-from fusion.report.charts.thermograms import draw_thermograms
-from fusion.report.findings import findings, first_screen
 from fusion.report.page import ProductsError, print_pdf, report_of
 from fusion.report.sheet import describe_sheet, write_iso230, write_thermal_tests
-from fusion.report.wording import caption, say
-from fusion.results.results import Results
+from fusion.report.wording import say
 from fusion.results.store import write_atomically
 
 
@@ -67,31 +64,24 @@ def _parts(state: ui.State, products: Products) -> ui.Parts:
     if hours is None and products.fields is not None:
         hours = products.field_hours
     linker = Linker(selection, targets, cycles, hours)
-    read = products.deviations is not None
+    report = products.folder / "report.html"
     builders: dict[str, tuple[bool, Callable[[], ui.Parts]]] = {
-        "Pictures": (products.thermograms is not None, lambda: _pictures(products)),
+        "Report": (report.is_file(), lambda: [ui.frame("Report", ui.report_link(state.root, products.folder))]),
         "Map": (products.fields is not None, lambda: [ThermalView(products, selection, linker).view]),
-        "Laser": (read, lambda: laser_charts(products, selection, linker)),
-        "Positions": (products.results.anomalies is not None, lambda: anomaly_cards(products, selection)),
-        "Cause": (products.results.loop is not None, lambda: loop_steps(products, linker)),
+        "Laser": (products.deviations is not None, lambda: laser_charts(products, selection, linker)),
     }
     shown = {name: build for name, (there, build) in builders.items() if there}
+    if not shown:
+        return [ui.paragraph(products.results.campaign), ui.note(f"{report} is missing: run the campaign again.")]
     parts = {name: partial(lambda build: ui.column(*_or_fault(build)), build) for name, build in shown.items()}
     chooser, part = ui.switched("Part", parts, next(iter(parts)))
-    lead = [ui.paragraph(products.results.campaign), *_outcome(products.results)]
-    if (products.folder / "report.html").is_file():
-        lead.append(ui.link("Open the report", ui.report_link(state.root, products.folder)))
-        lead.append(_printing(state, products))
-    return [*lead, *_chosen(selection, targets), chooser, part]
-
-
-def _outcome(results: Results) -> ui.Parts:
-    """What the report says before anything else, in words and in numbers."""
-    said = first_screen(results, {}, "", "")
-    kinds = {"open": "warning", "decision": "", "unmet": "warning", "cause": ""}
-    tiles = [one.tile for one in findings(results) if one.tile]
-    words = [ui.paragraph(said[name], kind=kind) for name, kind in kinds.items() if said[name]]
-    return [*words, ui.table(("Finding", "Value", "Of"), tiles, caption="In numbers")] if tiles else words
+    menu = _chosen(selection, targets)
+    if menu is not None:
+        chooser.param.watch(lambda event: menu.param.update(visible=event.new != "Report"), "value")
+    lead = [ui.paragraph(products.results.campaign)]
+    if report.is_file():
+        lead.append(ui.link("Open the report in a tab of its own", ui.report_link(state.root, products.folder)))
+    return [*lead, _printing(state, products), chooser, *([menu] if menu else []), part]
 
 
 def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
@@ -152,35 +142,13 @@ def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:
         return [ui.paragraph(str(error), kind="fault")]
 
 
-def _chosen(selection: Selection, targets: list[tuple[int, float]]) -> ui.Parts:
-    """The menu of the position that is shown everywhere."""
+def _chosen(selection: Selection, targets: list[tuple[int, float]]) -> pn.widgets.Select | None:
+    """The menu of the position that is shown everywhere but in the report, which stands first; None without a laser."""
     if not targets:
-        return []
+        return None
     names = {say("position_words", number, place): number for number, place in targets}
-    menu = pn.widgets.Select(label="Position shown everywhere", options=names, value=selection.target, width=280)
+    menu = pn.widgets.Select(
+        label="Position shown everywhere", options=names, value=selection.target, width=280, visible=False
+    )
     menu.link(selection, bidirectional=True, value="target")
-    return [menu]
-
-
-def _pictures(products: Products) -> ui.Parts:
-    """The charts of the pictures of a camera alone, each with what it shows."""
-    part, thermograms = products.results.thermograms, products.thermograms
-    assert thermograms is not None and part is not None
-    hottest = thermograms.attrs["hottest"]
-    captions = {
-        "thermogram": f"{hottest}, the hottest picture. △ highest, ▽ lowest.",
-        "region_history": caption("region_history"),
-        "profile": f"Temperature along the lines in {hottest}.",
-        "difference": "Last picture minus first.",
-        "histogram": f"How many pixels of {hottest} have which temperature.",
-    }
-    charts = draw_thermograms(thermograms, part.series)
-    return [
-        ui.column(
-            ui.heading(words, level=3),
-            pn.pane.Bokeh(charts[name].figure, sizing_mode="scale_width", max_width=820),
-            ui.note(charts[name].seen),
-        )
-        for name, words in captions.items()
-        if name in charts
-    ]
+    return menu

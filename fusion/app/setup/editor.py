@@ -26,10 +26,10 @@ from fusion.app.setup.form import (
     with_unit,
     write_fields,
 )
-from fusion.app.setup.plan import FrameView, Placed, Plan, PlanView, RegionsView, corners_of
+from fusion.app.setup.plan import FrameView, Placed, Plan, PlanView, RegionsView
 from fusion.app.setup.times import TimesView, recordings_of
 from fusion.campaign.columns import TableProposal
-from fusion.campaign.draft import separate_tests
+from fusion.campaign.draft import Asker, separate_tests, write_campaigns
 from fusion.campaign.inspect import FolderContent, Kind, Recording, scan_folder
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.messages import BAD_INPUT
@@ -42,7 +42,8 @@ from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
 @dataclass(frozen=True)
 class Opened:
     """What was read from a folder: its campaign file or the draft of one, the first thermogram (row, column; degC) with the fiducials
-    found in it, what was recorded when, the axis positions of the targets, the table of a record, and what could not be shown.
+    found in it, what was recorded when, the axis positions of the targets, the table of a record, what could not be shown, and how many
+    tests of an axis the folder holds where each is a campaign of its own.
     """
 
     folder: Path
@@ -53,16 +54,18 @@ class Opened:
     positions_mm: tuple[float, ...]
     table: TableProposal | None
     remarks: list[str]
+    tests: int = 0
 
 
 def open_folder(root: Path, folder: Path) -> Opened:
     """Read what the screen shows of a folder."""
     content, campaign = scan_folder(folder, within=root), open_campaign(folder, root)
     remarks: list[str] = []
-    if campaign.saved is None and (tests := separate_tests(content)):
+    tests = len(separate_tests(content)) if campaign.saved is None else 0
+    if tests:
         remarks.append(
-            f"{len(tests)} tests of an axis are in this folder, each a campaign of its own: thermofuse init {folder} writes one for each, "
-            f"in a folder of its own that can be looked into here, and thermofuse fleet runs them all. Shown is {tests[0].path.name} alone."
+            f"{tests} tests of an axis are in this folder, each a campaign of its own in a folder of its own; thermofuse fleet runs them "
+            "all. Shown is the first alone."
         )
     frame, placed = None, Placed()
     if content.frames:
@@ -75,7 +78,7 @@ def open_folder(root: Path, folder: Path) -> Opened:
     table = None
     if campaign.value("record", "columns") is not None and content.of(Kind.RECORD):
         table = content.of(Kind.RECORD)[0].content
-    return Opened(folder, campaign, frame, placed, recordings_of(content), positions_of(content), table, remarks)
+    return Opened(folder, campaign, frame, placed, recordings_of(content), positions_of(content), table, remarks, tests)
 
 
 def listed_fiducials(root: Path, campaign: CampaignText) -> list[Fiducial]:
@@ -117,22 +120,28 @@ class CampaignEditor:
                 {"plan.axis.origin.0": f"{round(x):g} mm", "plan.axis.origin.1": f"{round(y):g} mm"}
             ),
             lambda dx, dy: self._form.write({"plan.axis.direction": direction_text(dx, dy)}),
+            self._regions.take_point,
             self._regions.take_corners,
         )
         self._times = TimesView(lambda offset: self._form.write({"thermography.clock_offset": f"{offset:g} s"}))
         self._save = pn.widgets.Button(label="Save campaign.toml and check it", color="primary")
         self._go = pn.widgets.Button(label="Go to Run", visible=False)
+        self._split = pn.widgets.Button(label="Write a campaign for each test", color="primary")
         self._remarks, self._checked = ui.column(), ui.column()
         pictures = (self._times.view, self._frame.view, self._plan.view, self._regions.view)
-        buttons = pn.FlexBox(self._save, self._go)
-        self.view = ui.column(self._remarks, *pictures, self._columns.view, self._form.view, buttons, self._checked)
+        answer = ui.column(self._checked, styles={"max-height": "38vh", "overflow-y": "auto"})
+        self.saving = ui.column(pn.FlexBox(self._save, self._go), answer)
+        shown = (self._form.required, *pictures, self._columns.view, self._form.view)
+        self.view = ui.column(self._remarks, *shown)
         self._save.on_click(self._on_save)
+        self._split.on_click(self._on_split)
         self._go.on_click(lambda event: setattr(state, "screen", "Run"))
 
     def show(self, opened: Opened) -> None:
         """Show what was read."""
         self._opened = opened
-        self._remarks[:] = [ui.paragraph(remark, kind="warning") for remark in opened.remarks]
+        remarks = [ui.paragraph(remark, kind="warning") for remark in opened.remarks]
+        self._remarks[:] = [*remarks, *([self._split] if opened.tests else [])]
         self._form.show(opened.campaign)
         self._columns.show(opened.table, opened.campaign.value("record", "columns") or {})
         regions = opened.campaign.value("thermography", "region")
@@ -179,12 +188,21 @@ class CampaignEditor:
             direction = read_direction(self._form.texts.get("plan.axis.direction", ""))
         except FieldError:
             direction = None
-        outlines = ((str(one.get("name", "")), corners_of(one)) for one in self._regions.regions)
-        regions = tuple((name, corners) for name, corners in outlines if corners is not None)
         origin = None if x is None or y is None else (x, y)
         unit = "px" if is_picture(opened.campaign) else "mm"
-        plan = Plan(width, height, origin, direction, opened.positions_mm, regions, unit)
+        plan = Plan(width, height, origin, direction, opened.positions_mm, tuple(self._regions.outlines), unit)
         self._plan.show(plan, self._frame.placed, opened.frame)
+
+    async def _on_split(self, event: object) -> None:
+        """Write a campaign for each test of the folder, as `thermofuse init` does, and show where they are."""
+        assert self._opened is not None
+        with ui.disabled_during(self._split), ui.telling(self._remarks):
+            written = await asyncio.to_thread(write_campaigns, self._opened.folder, Asker(None))
+            told = [
+                f"{path}{': to be filled in: ' + ', '.join(lacking) if lacking else ''}" for path, lacking in written
+            ]
+            done = ui.paragraph("Written; look into their folders above to complete and run them:", kind="done")
+            ui.schedule_parts(self._remarks, [done, ui.bullets(told)])
 
     async def _on_save(self, event: object) -> None:
         """Write the campaign file and the list of fiducials, and check both."""

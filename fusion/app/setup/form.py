@@ -203,7 +203,8 @@ def with_unit(text: str, unit: str) -> str:
 
 
 class Form:
-    """Fields of a campaign file, in groups by table; `on_change` takes the name of a field whose text has changed.
+    """Fields of a campaign file, in groups by table, those without which it cannot run in a group of their own (`required`); `on_change`
+    takes the name of a field whose text has changed.
 
     Keys that few tests state are folded, and get their widgets when they are first unfolded.
     """
@@ -211,24 +212,28 @@ class Form:
     def __init__(self, on_change: Callable[[str], None]) -> None:
         self._on_change = on_change
         self._widgets: dict[str, pn.widgets.Widget] = {}
-        self.view = column()
+        self.view, self.required = column(), column()
 
     def show(self, campaign: CampaignText) -> None:
         """Show the fields of a campaign file."""
         self._widgets = {}
         fields, texts = form_fields(campaign), read_fields(campaign)
+        required = [one for one in fields.values() if not one.row and (one.needed or _is_marked(campaign, one))]
+        marked = [one._replace(label=f"{one.label} *") for one in required]
+        self.required[:] = [heading("Required (*)", level=3), self._side_by_side(marked, texts)] if marked else []
         tables: dict[tuple[str, ...], list[Key]] = {}
         for field in fields.values():
-            tables.setdefault(field.table, []).append(field)
+            if field not in required:
+                tables.setdefault(field.table, []).append(field)
         parts: Parts = []
         for table, listed in tables.items():
             title = listed[0].title
             if listed[0].row:
                 parts += [heading(title, level=3), self._rows(listed, texts, _rows(campaign, table))]
                 continue
-            # What init asks for or shows, and what its draft marks as to be filled in, is never folded.
-            first = [one for one in listed if one.first or _is_marked(campaign, one)]
-            others = [one for one in listed if one not in first]
+            # What init asks for or shows is never folded.
+            first = [one for one in listed if one.first]
+            others = [one for one in listed if not one.first]
             if first:
                 parts += [heading(title, level=3), self._side_by_side(first, texts)]
             if others:

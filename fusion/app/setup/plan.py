@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -380,6 +380,8 @@ class FrameView:
             self._add(*snapped(self._frame, event.x, event.y))
 
 
+#: A point of the plan, mm, or of the picture, px.
+Place: TypeAlias = tuple[float, float]
 _ORIGIN, _DIRECTION, _REGION = "Axis origin", "Axis direction", "Region"
 #: Free margin around the plan, as a share of its longer side.
 _ROOM = 0.02
@@ -429,31 +431,37 @@ def on_plan(frame: NDArray[np.float64], registration: Registration, plan: Plan) 
 
 
 class PlanView:
-    """The plan, on which an origin (x, y), a direction (dx, dy) and opposite corners of a region are drawn, mm."""
+    """The plan, on which an origin (x, y), a direction (dx, dy), points of a region and two ends of one are drawn, mm."""
 
     def __init__(
         self,
         on_origin: Callable[[float, float], None],
         on_direction: Callable[[float, float], None],
-        on_region: Callable[[tuple[float, float], tuple[float, float]], None],
+        on_point: Callable[[Place], None],
+        on_region: Callable[[Place, Place], None],
     ) -> None:
-        self._on_origin, self._on_direction, self._on_region = on_origin, on_direction, on_region
+        self._on_origin, self._on_direction, self._on_point, self._on_region = (
+            on_origin,
+            on_direction,
+            on_point,
+            on_region,
+        )
         self._plan: Plan | None = None
-        self._start: tuple[float, float] | None = None
+        self._start: Place | None = None
         self._mode = pn.widgets.RadioButtonGroup(label="A click draws", options=[_ORIGIN, _DIRECTION, _REGION])
         self._picture = column()
         how = (
-            "Click the point under the spindle at axis position 0, then a point to which it moves as the position grows. A region is "
-            "dragged from corner to corner. The fields below take the same as numbers."
+            "Axis: click the point under the spindle at axis position 0, then a point to which it moves as the position grows. Region: "
+            "choose its shape below, then click its points, or drag from corner to corner or end to end. The fields below take the same "
+            "as numbers."
         )
-        self._axis = column(heading("Axis and regions on the plan", level=3), note(how), self._mode)
-        self.view = column(self._axis, self._picture)
+        self.view = column(heading("Axis and regions", level=3), note(how), self._mode, self._picture)
 
     def show(self, plan: Plan, placed: Placed, frame: NDArray[np.float64] | None) -> None:
         """Show a plan."""
         self._plan = plan
         in_px = plan.unit == "px"
-        self._axis.visible = not in_px
+        self._mode.visible = not in_px
         if in_px:
             self._mode.value = _REGION
         # The centre of the first pixel is (0, 0), the corner of a plan in mm too; its cross and the discs at its rim are seen whole.
@@ -476,6 +484,7 @@ class PlanView:
             add_names(drawn, [0], [0], ["origin"], x_offset=6, y_offset=16)
         for name, corners in plan.regions:
             drawn.patch(*corners.T.tolist(), fill_color=ACCENT, fill_alpha=0.15, line_color=ACCENT, line_width=2)
+            drawn.scatter(*corners.T.tolist(), marker="circle", size=5, color=ACCENT)
             drawn.text(corners[:1, 0], corners[:1, 1], [name], text_color=ACCENT, **_LABEL)
         _draw_axis(drawn, plan)
         drawn.on_event(Tap, self._on_tap)
@@ -491,6 +500,8 @@ class PlanView:
             dx, dy = event.x - self._plan.origin_mm[0], event.y - self._plan.origin_mm[1]
             if dx or dy:
                 self._on_direction(dx, dy)
+        elif self._mode.value == _REGION:
+            self._on_point((event.x, event.y))
 
     def _on_drag(self, event: Any) -> None:
         self._start = (event.x, event.y) if self._mode.value == _REGION else None
@@ -515,77 +526,117 @@ def _draw_axis(drawn: Any, plan: Plan) -> None:
         drawn.add_layout(Arrow(end=head, x_start=x, y_start=y, x_end=x_end, y_end=y_end, line_color=INK, line_width=2))
 
 
+#: Shapes of a region that are drawn, with the fewest and the most points of each.
+SHAPES = {"rectangle": (2, 2), "polygon": (3, 99), "line": (2, 2), "spot": (1, 1)}
+
+
 def corners_of(region: dict[str, Any]) -> Array | None:
-    """Return the corners of a region as a campaign file writes it, (n, 2) mm or px; None where they cannot be read."""
+    """Return the outline of a region as a campaign file writes it, (n, 2) mm or px; None where it cannot be read."""
     try:
-        written = region.get("polygon") or region["rectangle"]
+        shape = next(name for name in (*SHAPES, "ellipse") if region.get(name))
+        written = [region[shape]] if shape == "spot" else region[shape]
         unit = "px" if "px" in str(written) else "mm"
-        points = [[read_quantity(text, unit) for text in one] for one in written]
-    except (QuantityError, KeyError, TypeError):
+        points = np.array([[read_quantity(text, unit) for text in one] for one in written], float)
+    except (StopIteration, QuantityError, ValueError, TypeError):
         return None
-    if not region.get("polygon"):
+    return outline(shape, points)
+
+
+def outline(shape: str, points: Array) -> Array:
+    """Return the points (n, 2) of a shape as a line around it is drawn through them."""
+    if shape == "ellipse":
+        angle = np.linspace(0.0, 2.0 * np.pi, 60)
+        middle, half = points.mean(axis=0), np.ptp(points, axis=0) / 2
+        return np.asarray(middle + half * np.column_stack([np.cos(angle), np.sin(angle)]))
+    if shape == "rectangle" and len(points) == 2:
         (x0, y0), (x1, y1) = points
-        points = [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]
-    return np.array(points, float)
+        return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    return points
 
 
-def region_table(
-    name: str, emissivity: str, corners: Sequence[tuple[float, float]], unit: str = "mm"
-) -> dict[str, Any]:
-    """Return a rectangular region as a campaign file writes it; without an emissivity, that of the frames."""
-    rectangle = [[f"{round(value, 1):g} {unit}" for value in corner] for corner in corners]
-    return {"name": name, "rectangle": rectangle, **({"emissivity": emissivity} if emissivity else {})}
+def region_table(name: str, emissivity: str, shape: str, points: Sequence[Place], unit: str = "mm") -> dict[str, Any]:
+    """Return a region as a campaign file writes it; without an emissivity, that of the frames."""
+    written = [[f"{round(value, 1):g} {unit}" for value in point] for point in points]
+    of_shape = written[0] if shape == "spot" else written
+    return {"name": name, shape: of_shape, **({"emissivity": emissivity} if emissivity else {})}
 
 
 # Regions, maybe with an emissivity of their own, as a list that is added to and taken from.
 
-_CORNERS = ("x of one corner", "y of one corner", "x of the other", "y of the other")
-
 
 class RegionsView:
-    """Regions as the campaign file writes them, in mm or px; `on_change` is called whenever they have changed."""
+    """Regions as the campaign file writes them, in mm or px, and the one that is drawn now; `on_change` is called when one has changed."""
 
     def __init__(self, on_change: Callable[[], None]) -> None:
         self.regions: list[dict[str, Any]] = []
         self._changed, self._unit = on_change, "mm"
+        self._shape = pn.widgets.Select(label="Shape of the region", options=list(SHAPES), width=150)
+        self._points = pn.widgets.TextInput(label="Its points", placeholder="100, 20; 180, 60", width=280)
         self._name = pn.widgets.TextInput(label="Name of the region", width=190)
         self._emissivity = pn.widgets.TextInput(label="Its emissivity", placeholder="0.35 +- 0.05", width=190)
-        self._corners = [pn.widgets.FloatInput(label=label, width=170, step=1.0) for label in _CORNERS]
         self._chosen = pn.widgets.Select(label="Regions", options=[], width=190)
         self._told = markup("")
         add, remove = pn.widgets.Button(label="Add the region"), pn.widgets.Button(label="Remove the region")
         add.on_click(self._add)
         remove.on_click(self._remove)
-        fields = pn.FlexBox(self._name, self._emissivity, *self._corners, add)
+        self._shape.param.watch(lambda event: self._take([]), "value")
+        self._points.param.watch(lambda event: self._changed(), "value")
+        fields = pn.FlexBox(self._shape, self._points, self._name, self._emissivity, add)
         title = heading("Regions", level=3)
         self.view = column(title, fields, pn.FlexBox(self._chosen, remove), self._told)
+
+    @property
+    def outlines(self) -> list[tuple[str, Array]]:
+        """Names and outlines of all regions, and of the one that is being drawn."""
+        drawn = [(str(one.get("name", "")), corners_of(one)) for one in self.regions]
+        points = self._read()
+        drawn.append((self._name.value, outline(self._shape.value, np.array(points, float)) if points else None))
+        return [(name, corners) for name, corners in drawn if corners is not None]
 
     def show(self, regions: list[dict[str, Any]], unit: str | None = None) -> None:
         """Show regions, whose unit stays where none is given."""
         self.regions, self._unit = regions, unit or self._unit
-        for entry, label in zip(self._corners, _CORNERS, strict=True):
-            entry.label = f"{label} ({self._unit})"
+        self._points.label = f"Its points, x, y in {self._unit}"
         names = [str(one.get("name", "")) for one in regions]
         self._chosen.param.update(options=names, value=names[-1] if names else None)
 
-    def take_corners(self, one: tuple[float, float], other: tuple[float, float]) -> None:
-        """Take the corners of a drawn rectangle."""
-        for entry, value in zip(self._corners, (*one, *other), strict=True):
-            entry.value = round(value, 1)
-        told = "The corners are taken; give the region a name, and an emissivity where it has its own, then add it."
+    def take_point(self, point: Place) -> None:
+        """Take a place that was clicked as the next point; one more than the shape has begins it anew."""
+        points = self._read() or []
+        self._take([*points, point] if len(points) < SHAPES[self._shape.value][1] else [point])
+
+    def take_corners(self, one: Place, other: Place) -> None:
+        """Take both ends of what was dragged."""
+        if self._shape.value in ("polygon", "spot"):
+            self._shape.value = "rectangle"
+        self._take([one, other])
+
+    def _take(self, points: Sequence[Place]) -> None:
+        self._points.value = "; ".join(f"{x:.1f}, {y:.1f}" for x, y in points)
+        enough = len(points) >= SHAPES[self._shape.value][0]
+        told = "Give the region a name, and an emissivity where it has its own, then add it." if enough else ""
         self._told.object = paragraph_markup(told, kind="done")
 
+    def _read(self) -> list[Place] | None:
+        """Return the points that are written, None where they are no pairs of numbers."""
+        try:
+            pairs = [one.split(",") for one in self._points.value.split(";") if one.strip()]
+            return [(float(x), float(y)) for x, y in pairs]
+        except ValueError:
+            return None
+
     def _add(self, event: object) -> None:
-        corners = [field.value for field in self._corners]
+        points, shape = self._read() or [], self._shape.value
         name, emissivity = self._name.value.strip(), self._emissivity.value.strip()
-        taken = name in [one.get("name") for one in self.regions]
-        if not name or taken or None in corners:
-            told = f"A region needs a name of its own and two opposite corners in {self._unit}."
-            self._told.object = paragraph_markup(told, kind="fault")
+        least, most = SHAPES[shape]
+        if not name or name in [one.get("name") for one in self.regions] or not least <= len(points) <= most:
+            corners = {"rectangle": "two opposite corners", "line": "two ends", "spot": "one point"}
+            asked = f"{corners.get(shape, 'three corners or more')} as x, y in {self._unit}"
+            self._told.object = paragraph_markup(f"A {shape} needs a name of its own and {asked}.", kind="fault")
             return
-        places = [(corners[0], corners[1]), (corners[2], corners[3])]
-        self.show([*self.regions, region_table(name, emissivity, places, self._unit)])
-        self._told.object = self._name.value = self._emissivity.value = ""
+        self.show([*self.regions, region_table(name, emissivity, shape, points, self._unit)])
+        self._name.value = self._emissivity.value = ""
+        self._take([])
         self._changed()
 
     def _remove(self, event: object) -> None:

@@ -28,12 +28,15 @@ class SetUpScreen:
         )
         self._taken: set[str] = set()
         self._dropped, self._found, self._below = ui.column(), ui.column(), ui.column()
+        # At the lower edge of the window, wherever the page stands.
+        self._saving = ui.column(css_classes=["in-view"], visible=False)
         self.editor: CampaignEditor | None = None
         self._look.on_click(self.look)
         self._drop.param.watch(self._on_drop, "value")
         row = pn.Row(self._folder, self._look, sizing_mode="stretch_width")
         how = ui.note(f"Files can be dropped here; they go into this folder, up to {LARGEST_MB} MB each.")
-        self.view = ui.column(ui.heading("Set up"), row, how, self._drop, self._dropped, self._found, self._below)
+        parts = (row, how, self._drop, self._dropped, self._found, self._below, self._saving)
+        self.view = ui.column(ui.heading("Set up"), *parts)
 
     async def look(self, event: object = None) -> None:
         """Look into the folder that is typed, and show what is in it."""
@@ -46,6 +49,7 @@ class SetUpScreen:
         with ui.disabled_during(self._look), ui.telling(self._found, found):
             ui.schedule_parts(self._dropped, [])
             ui.schedule_parts(self._below, [])
+            ui.schedule_update(lambda: self._saving.param.update(visible=False))
             ui.schedule_parts(self._found, [ui.note("Looking into the files ...")])
             found += await asyncio.to_thread(found_in_folder, folder, self._state.root)
             ui.schedule_parts(self._found, [*found, ui.note("Reading the first frame and the recordings ...")])
@@ -61,6 +65,7 @@ class SetUpScreen:
         self.editor = self.editor or CampaignEditor(self._state)
         self.editor.show(opened)
         self._below[:] = [self.editor.view]
+        self._saving.param.update(objects=[self.editor.saving], visible=True)
 
     def _on_drop(self, event: Any) -> None:
         """Write what was dropped into the folder; its content is not kept in memory, its line in the list of the page stays."""

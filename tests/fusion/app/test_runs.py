@@ -83,16 +83,19 @@ def test_a_step_tells_how_far_it_is_and_counts_anew_when_it_begins_again():
     progress = Progress()
     progress.take("frames", 0, 60, 100.0)
     assert progress.stages["frames"].words == "under way"
-    progress.take("frames", 15, 60, 110.0)
+    progress.take("frames", 1, 60, 112.0)
+    assert progress.stages["frames"].words == "1 of 60", "the first part waits for all that has to start"
+    progress.take("frames", 15, 60, 119.0)
     assert progress.stages["frames"].share == 0.25
-    assert progress.stages["frames"].words == "15 of 60, about 30 s left"
+    assert progress.stages["frames"].words == "15 of 60, about 22 s left"
     progress.take("frames", 60, 60, 140.0)
     assert progress.stages["frames"].words == "done in 40 s"
     progress = Progress()
     progress.take("loop", 5, 5, 10.0)
     progress.take("loop", 0, 5, 20.0)
     progress.take("loop", 1, 5, 21.0)
-    assert progress.stages["loop"].words == "1 of 5, about 4 s left"
+    progress.take("loop", 2, 5, 22.0)
+    assert progress.stages["loop"].words == "2 of 5, about 3 s left"
     progress.take("maps", 0, 0, 30.0)
     assert progress.stages["maps"].words == "done"
     assert list(progress.stages) == ["loop", "maps"]

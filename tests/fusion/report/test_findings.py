@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from fusion.app.results.screen import _outcome
 from fusion.pipeline.consistency import inputs_part
 from fusion.report.campaign import describe_campaign
 from fusion.report.exports.tables import findings_table
@@ -19,7 +18,6 @@ from fusion.report.fleet import Row, with_findings
 from fusion.report.page import render_page
 from fusion.results.results import Notice, Results, assemble
 from fusion.results.store import write_json
-from tests.fusion.app.texts import texts
 from tests.fusion.report.test_campaign import ORIGIN
 from tests.fusion.report.test_fleet import PICTURES
 from tests.fusion.report.test_record import record
@@ -80,7 +78,6 @@ def surfaces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, An
         shown[name] = {
             "page": one_line(render_page("report.html.j2", {}, **given)),
             "terminal": one_line(printed.getvalue()),
-            "application": one_line(texts(_outcome(results))),
             "workbook": dict(zip(*findings_table(results)[["finding", "value"]].T.values, strict=True)),
             "fleet": with_findings(Row(name, state="finished"), folder),
         }
@@ -108,7 +105,7 @@ def test_a_finding_stands_on_every_surface_that_shows_it(
         assert f"{one.name} {one_line(one.text)}" in shown["terminal"]
         assert one.text in shown["workbook"][one.name]
     if one.tile:
-        assert " ".join(one.tile).strip() in shown["page"] and " ".join(one.tile).strip() in shown["application"]
+        assert " ".join(one.tile).strip() in shown["page"]
     if one.value is not None and hasattr(shown["fleet"], key := f"{one.code}_{one.unit}"):
         assert getattr(shown["fleet"], key) == one.value.value
         assert getattr(shown["fleet"], f"{one.code}_u_{one.unit}", None) == one.value.u

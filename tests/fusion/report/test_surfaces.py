@@ -16,9 +16,8 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from fusion.app.results.charts import anomaly_cards, laser_charts, loop_steps
+from fusion.app.results.charts import laser_charts
 from fusion.app.results.data import Linker, Products, Selection
-from fusion.app.results.screen import _outcome
 from fusion.pipeline.compare import compare_campaigns
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
@@ -174,13 +173,8 @@ def surfaces(run, tmp_path_factory) -> Mapping[str, str]:
         write_iso230(out / name, sheet, test.part, test.dataset, remarks=test.remarks)
     if CHROMIUM:
         write_iso230(out / "sheet.pdf", sheet, test.part, test.dataset, remarks=test.remarks)
-    products = Products(run)
-    selection = Selection(cycle=1, target=3)
-    linker = Linker(selection, products.targets, products.cycles, None)
-    parts = [
-        *_outcome(products.results), *laser_charts(products, selection, linker), *loop_steps(products, linker),
-        *anomaly_cards(products, selection),
-    ]  # fmt: skip
+    products, selection = Products(run), Selection(cycle=1, target=3)
+    parts = laser_charts(products, selection, Linker(selection, products.targets, products.cycles, None))
     again = shutil.copytree(run, out / "again")
     return {
         **common_surfaces(run, out),
@@ -226,7 +220,7 @@ def places() -> Iterator[tuple[str, dict[str, tuple[str, ...]]]]:
         listed = rf"(Pass|Fail|Not decided): (?:(?!Pass:|Fail:|Not decided:).)*?(?<!\w){symbol} ≤ "
         judged = rf"{title} {VALUE.replace('(', '(?:')} \d+ {DECISION}"
         yield f"decision on {symbol}", {
-            **on(surfaces, judged), "report": (judged, listed), "application": (listed,),
+            **on(surfaces, judged), "report": (judged, listed),
             "comparison": (rf"{symbol} at most \d+ µm {DECISION}",),
         }  # fmt: skip
     yield (
@@ -251,12 +245,12 @@ def places() -> Iterator[tuple[str, dict[str, tuple[str, ...]]]]:
     }  # fmt: skip
     yield "held-out error before", {
         **on(PRINTED, rf"held-out error:? {NUMBER} ->"), **on(SUMMARISED, rf"held-out error {NUMBER} ->"),
-        "report": (rf"declared model {NUMBER}",), "application": (rf"declared model {NUMBER}",),
+        "report": (rf"declared model {NUMBER}",),
     }  # fmt: skip
     yield "held-out error after", {
         **on(PRINTED, rf"-> {NUMBER} µm"), **on(SUMMARISED, rf"held-out error [\d.]+ -> {NUMBER} µm"),
         "report": (rf"Held-out error {NUMBER} µm", rf"with the added effects {NUMBER}"),
-        "application": (rf"with the added effects {NUMBER}",), **on(FLEET, rf"[Hh]eld-out error / µm {NUMBER}"),
+        **on(FLEET, rf"[Hh]eld-out error / µm {NUMBER}"),
     }  # fmt: skip
     words = {"print": r"verdict:? (\w+)", "terminal": r"verdict (\w+)(?:: | \()", "fleet": r"[Vv]erdict (\w+)"}
     yield "verdict", {
@@ -264,14 +258,14 @@ def places() -> Iterator[tuple[str, dict[str, tuple[str, ...]]]]:
     }  # fmt: skip
     apart = r"Position (\d+) \(\d+ mm\) repeats worse"
     yield "position that stands out", {
-        **on(PRINTED, r"anomalies:? position (\d+)"), **on((*SUMMARISED, "application"), apart),
+        **on(PRINTED, r"anomalies:? position (\d+)"), **on(SUMMARISED, apart),
         "comparison": (r"positions that stand out Position (\d+)",),
     }  # fmt: skip
     yield (
         "p of it",
         {
             **on(PRINTED, r"structural, p (\S+ [\d.]+),"),
-            **on((*SUMMARISED, "application"), r"µm \(p (\S+ [\d.]+), resolution"),
+            **on(SUMMARISED, r"µm \(p (\S+ [\d.]+), resolution"),
         },
     )
     yield (

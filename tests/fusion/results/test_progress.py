@@ -37,7 +37,7 @@ def test_plain_lines_speak_up_during_a_long_step(monkeypatch: pytest.MonkeyPatch
     clock = iter([0.0, 0.0, 4.0, 11.0, 12.0, 30.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
     told = shown(*(("frames", done, 10) for done in (0, 1, 2, 3, 10)))
-    assert told.splitlines() == ["frames ...", "frames: 2 of 10, about 44 s left", "frames: done in 30.0 s"]
+    assert told.splitlines() == ["frames ...", "frames: 2 of 10, about 56 s left", "frames: done in 30.0 s"]
 
 
 def test_a_step_that_takes_ten_times_its_forecast_says_so_once_and_how_to_stop_it(

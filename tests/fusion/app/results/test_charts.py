@@ -1,31 +1,18 @@
-"""Parts of the screen *Results*: laser, closed loop, positions, and the thermal map."""
+"""Parts of the screen *Results*: the charts of the laser and the thermal map."""
 
 import numpy as np
 import panel as pn
 import pytest
-import xarray as xr
 from bokeh.events import Tap
 from bokeh.models import LinearColorMapper, Text
 
-from fusion.app.results.charts import (
-    ThermalView,
-    anomaly_cards,
-    effects_left,
-    laser_charts,
-    loop_steps,
-    reading_hours,
-    record_charts,
-    table_of,
-)
+from fusion.app.results.charts import ThermalView, laser_charts, reading_hours, table_of
 from fusion.app.results.data import Linker, Place, Products, Selection
 from fusion.report.wording import caption, table
 from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart
-from fusion.results.results import AnomalyPart, AxisLoop, CorrelationPart
-from fusion.results.store import DamagedProductError
+from fusion.results.results import CorrelationPart
 from tests.fusion.app.texts import texts
-from tests.fusion.report.test_record import record
-from tests.fusion.results_sample import PARTS
 
 
 def linker_of(products, selection):
@@ -46,7 +33,9 @@ def test_the_chosen_position_is_drawn_over_the_others(products):
     chosen = course.renderers[-1].data_source
     before = np.array(chosen.data["y"])
     selection.target = 5
-    np.testing.assert_allclose(chosen.data["y"], products.drift["drift"].mean("direction").sel(target=5).values)
+    np.testing.assert_allclose(
+        chosen.data["y"], products.drift["drift_since_first"].mean("direction").sel(target=5).values
+    )
     assert not np.allclose(before, chosen.data["y"])
 
 
@@ -58,88 +47,9 @@ def test_the_readings_follow_the_choice(products):
     assert "Readings at 150 mm" in texts(parts) and "Readings at 50 mm" not in texts(parts)
 
 
-def parts_of(products):
-    selection = Selection(cycle=1, target=1)
-    return texts(loop_steps(products, Linker(selection, products.targets, products.cycles, None)))
-
-
-def test_every_round_has_residual_scores_and_effect(products):
-    told, loop = parts_of(products), products.results.loop
-    assert isinstance(loop, AxisLoop) and loop.steps
-    for turn in range(1, len(loop.steps) + 1):
-        assert f"Round {turn}" in told
-    of_round = ("Residual before this round", "Best candidate of every effect in round 1", "Entered")
-    for words in (*of_round, "What the final model leaves", "What to do next"):
-        assert words in told
-
-
-def test_before_a_step_its_effect_is_put_back():
-    dims = ("cycle", "direction", "target")
-    stored = xr.Dataset(
-        {
-            "residual_final": (dims, np.full((2, 2, 3), 0.5)),
-            "contribution": (("effect", *dims), np.arange(3.0)[:, None, None, None] * np.ones((3, 2, 2, 3))),
-        }
-    )
-    loop = AxisLoop.model_construct(declared=("axis_expansion",), steps=(object(), object()))
-    assert float(effects_left(stored, loop, 0)[0, 0, 0]) == 0.5 + 1.0 + 2.0
-    assert float(effects_left(stored, loop, 1)[0, 0, 0]) == 0.5 + 2.0
-    assert float(effects_left(stored, loop, 2)[0, 0, 0]) == 0.5
-
-
-def test_steps_of_another_run_are_refused(products):
-    loop = products.results.loop
-    assert isinstance(loop, AxisLoop) and loop.steps
-    other = Products(products.folder)
-    for steps in (loop.steps * 20, (loop.steps[0].model_copy(update={"effect": "dead_path"}),)):
-        other.results = products.results.model_copy(update={"loop": loop.model_copy(update={"steps": steps})})
-        with pytest.raises(DamagedProductError, match=r"fusion\.nc: its effects are not the steps of results\.json"):
-            parts_of(other)
-
-
 def test_text_of_a_table_is_never_markup():
     shown = table_of(table(["a", "b"], [["<b>x</b>", "1"]]), "<i>caption</i>")
     assert "<b>x" not in shown.object and "&lt;b&gt;x" in shown.object and "<i>" not in shown.object
-
-
-def test_the_charts_of_one_displacement_of_a_record_are_chosen_in_a_menu():
-    measured = record(channels=3).assign(driver_units=("driver_name", ["1/min"]), driver_size=("driver_name", [1.0]))
-    measured["displacement"].loc[{"channel": "c1"}] = [0.0, 1.0, 2.0, 3.0]
-    shown = pn.Column(*record_charts(measured))
-    (menu,) = shown.select(pn.widgets.Select)
-    assert menu.options == ["X", "c1", "c2"] and menu.value == "c1", "the one that moves most stands first"
-    assert len(shown.select(pn.pane.Bokeh)) == 4, "two of the displacement, temperatures, drivers"
-    assert "c1 measured from 0" in texts([shown]) and "X measured" not in texts([shown])
-    menu.value = "X"
-    assert "X measured from" in texts([shown])
-
-
-@pytest.fixture
-def marked(results_folder):
-    """The results with one position that stands out, whose texts hold markup."""
-    loaded = Products(results_folder)
-    one = {**PARTS["anomalies"][0], "position_mm": 100.0}
-    one["evidence"] = {**one["evidence"], "for": ["<b>bold</b>"]}
-    loaded.results = loaded.results.model_copy(update={"anomalies": (AnomalyPart.model_validate(one),)})
-    return loaded
-
-
-def test_a_card_says_why_below_the_scatter_of_every_position_and_chooses_the_position(marked):
-    selection = Selection(cycle=2, target=1)
-    scatter, card = anomaly_cards(marked, selection)
-    assert "marked as standing out: 100 mm" in texts([scatter])
-    told = texts([card])
-    assert "Position 3, both approaches: mechanical scatter" in told
-    assert "What to inspect: c" in told
-    assert not any("<b>bold" in str(pane.object) for pane in card.select(pn.pane.HTML))
-    (button,) = card.select(pn.widgets.Button)
-    button.clicks += 1
-    assert selection.target == 3
-
-
-def test_that_no_position_stands_out_is_told(marked):
-    marked.results = marked.results.model_copy(update={"anomalies": ()})
-    assert "No position stands out" in texts(anomaly_cards(marked, Selection()))
 
 
 @pytest.fixture

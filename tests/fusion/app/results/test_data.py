@@ -51,13 +51,13 @@ def test_a_laser_alone_a_camera_alone_and_no_results(results_folder, tmp_path):
     for name in ("deviations.nc", "fusion.nc"):
         (camera / name).unlink()
     seen = Products(camera)
-    assert seen.deviations is None and seen.drift is None and seen.loop is None and seen.targets == []
+    assert seen.deviations is None and seen.drift is None and seen.targets == []
     assert seen.cycles.size == 24 and seen.field_hours[0] == 0.0
     with pytest.raises(ResultsError, match=r"there is no results\.json in it"):
         Products(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["fields", "deviations", "fusion"])
+@pytest.mark.parametrize("name", ["fields", "deviations"])
 def test_a_damaged_product_is_named(results_folder, tmp_path, name):
     (tmp_path / "results.json").write_bytes((results_folder / "results.json").read_bytes())
     (tmp_path / f"{name}.nc").write_bytes((results_folder / f"{name}.nc").read_bytes()[:5000])

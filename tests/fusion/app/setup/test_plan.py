@@ -183,6 +183,7 @@ def test_clicks_draw_origin_then_direction_and_a_drag_a_region():
     view = PlanView(
         lambda x, y: drawn.append(("origin", x, y)),
         lambda dx, dy: drawn.append(("direction", dx, dy)),
+        lambda point: drawn.append(("point", point)),
         lambda one, other: drawn.append(("region", one, other)),
     )
     view.show(PLAN, Placed(), None)
@@ -194,11 +195,16 @@ def test_clicks_draw_origin_then_direction_and_a_drag_a_region():
     view._on_tap(SimpleNamespace(x=0.0, y=0.0))
     view._on_drag(SimpleNamespace(x=1.0, y=2.0))
     view._on_drop(SimpleNamespace(x=3.0, y=4.0))
-    assert drawn == [("origin", 150.0, 50.0), ("direction", -50.0, 1.0), ("region", (1.0, 2.0), (3.0, 4.0))]
+    assert drawn == [
+        ("origin", 150.0, 50.0),
+        ("direction", -50.0, 1.0),
+        ("point", (0.0, 0.0)),
+        ("region", (1.0, 2.0), (3.0, 4.0)),
+    ]
 
 
 def test_the_plan_marks_its_origin_and_names_its_fiducials_as_the_camera_sees_them():
-    view = PlanView(*[lambda *drawn: None] * 3)
+    view = PlanView(*[lambda *drawn: None] * 4)
     view.show(PLAN, Placed((Fiducial("F1", 10.0, 15.0, 0.0),)), None)
     (pane,) = view.view.select(pn.pane.Bokeh)
     names = {}
@@ -214,12 +220,16 @@ def test_the_plan_marks_its_origin_and_names_its_fiducials_as_the_camera_sees_th
 
 
 def test_regions_are_read_as_the_campaign_file_writes_them():
-    table = region_table("way", "0.3 +- 0.1", [(1.04, 2.0), (3.0, 4.0)])
+    table = region_table("way", "0.3 +- 0.1", "rectangle", [(1.04, 2.0), (3.0, 4.0)])
     assert table == {"name": "way", "rectangle": [["1 mm", "2 mm"], ["3 mm", "4 mm"]], "emissivity": "0.3 +- 0.1"}
     corners = corners_of(table)
     assert corners.tolist() == [[1, 2], [3, 2], [3, 4], [1, 4]]
     polygon = corners_of({"polygon": [["0 mm", "0 mm"], ["9 mm", "0 mm"], ["0 mm", "9 mm"]]})
     assert polygon.shape == (3, 2)
+    assert corners_of({"spot": ["3 px", "4 px"]}).tolist() == [[3, 4]]
+    assert corners_of({"ellipse": [["0 mm", "0 mm"], ["4 mm", "2 mm"]]}).max(axis=0).tolist() == pytest.approx(
+        [4, 2], abs=0.01
+    )
     assert corners_of({}) is None and corners_of({"rectangle": [["x", "y"]]}) is None
 
 
@@ -234,12 +244,35 @@ def test_a_drawn_region_is_added_once_and_removed():
         view._name.value, view._emissivity.value = "way", "0.35 +- 0.05"
         view._add(None)
         assert len(view.regions) == expected, "a second region of that name is refused"
-    assert view.regions[0]["rectangle"] == [["1 mm", "2 mm"], ["30 mm", "40 mm"]] and len(changes) == 1
+    assert view.regions[0]["rectangle"] == [["1 mm", "2 mm"], ["30 mm", "40 mm"]] and changes
     view._remove(None)
-    assert view.regions == [] and len(changes) == 2
+    assert view.regions == []
     view.show([], "px")
     view.take_corners((1.0, 2.0), (30.0, 40.0))
     view._name.value, view._emissivity.value = "way", ""
     view._add(None)
     assert view.regions == [{"name": "way", "rectangle": [["1 px", "2 px"], ["30 px", "40 px"]]}]
     assert corners_of(view.regions[0]).tolist()[2] == [30.0, 40.0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "clicked", "written"),
+    [
+        ("spot", [(9, 9), (1, 2)], ["1 mm", "2 mm"]),
+        ("line", [(9, 9), (8, 8), (1, 2), (3, 4)], [["1 mm", "2 mm"], ["3 mm", "4 mm"]]),
+        ("polygon", [(0, 0), (9, 0), (0, 9)], [["0 mm", "0 mm"], ["9 mm", "0 mm"], ["0 mm", "9 mm"]]),
+    ],
+)
+def test_a_shape_is_clicked_point_by_point_and_seen_while_it_is_drawn(shape, clicked, written):
+    view = RegionsView(lambda: None)
+    view._shape.value = shape
+    for point in clicked:
+        view.take_point(point)
+    view._name.value = "zone"
+    assert [name for name, _ in view.outlines] == ["zone"]
+    view._add(None)
+    assert view.regions == [{"name": "zone", shape: written}] and len(view.outlines) == 1
+    view._points.value = "1, 2; three"
+    view._name.value = "other"
+    view._add(None)
+    assert "needs a name of its own and" in view._told.object and len(view.regions) == 1

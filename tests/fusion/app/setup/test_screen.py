@@ -58,6 +58,20 @@ def test_roles_and_units_of_a_record_are_chosen_on_the_screen(tmp_path):
     assert "ready to run" in texts([screen.view])
 
 
+def test_of_several_laser_tests_each_becomes_a_campaign_by_a_click(tmp_path):
+    rows = "\n".join(f"{place},0.1,0.2,0.3,0.2" for place in (0, 50, 100))
+    for name in ("X", "Y"):
+        (tmp_path / f"{name}_axis.csv").write_text(f"Position [mm],1+ [um],1- [um],2+ [um],2- [um]\n{rows}\n")
+    screen = SetUpScreen(State(root=tmp_path))
+    asyncio.run(screen.look())
+    assert "2 tests of an axis are in this folder" in texts([screen.view])
+    asyncio.run(screen.editor._on_split(None))
+    for name in ("X", "Y"):
+        assert (tmp_path / f"{name}_axis" / "campaign.toml").is_file() and f"{name}_axis/campaign.toml" in texts(
+            [screen.view]
+        )
+
+
 def test_a_check_is_told_with_its_faults_or_as_ready(copied):
     assert "ready to run" in told_of_check(check_campaign(copied / "campaign.toml"))[0].object
     (copied / "environment.csv").unlink()
@@ -128,11 +142,14 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(app, new_folder, n
     page.get_by_text("12 fiducials agree").wait_for()
     save = page.get_by_role("button", name="Save campaign.toml")
     save.press("Enter")
-    page.get_by_text("Before it can run, fill in:").wait_for()
+    answer = page.get_by_text("Before it can run, fill in:")
+    answer.wait_for()
+    top = answer.bounding_box()["y"]
+    assert 0 < top < 900, "the answer is in view, wherever the page stands"
     for label, text in (
-        ("Spindle at axis position 0, x (mm)", "500"),
-        ("Spindle at axis position 0, y (mm)", "90 mm"),
-        ("How that point moves as the position grows", "left"),
+        ("Spindle at axis position 0, x * (mm)", "500"),
+        ("Spindle at axis position 0, y * (mm)", "90 mm"),
+        ("How that point moves as the position grows *", "left"),
         ("Machine", "<b>Mill</b>"),
     ):
         page.get_by_label(label, exact=True).fill(text)
@@ -177,10 +194,3 @@ def test_files_are_dropped_into_the_folder_and_a_wrong_or_large_one_is_refused(a
     field.press("Tab")
     look.press("Enter")
     page.get_by_role("alert").get_by_text("lies outside").wait_for()
-
-
-def test_of_several_laser_tests_the_screen_says_how_each_becomes_a_campaign(tmp_path):
-    rows = "\n".join(f"{place},0.1,0.2,0.3,0.2" for place in (0, 50, 100))
-    for name in ("X", "Y"):
-        (tmp_path / f"{name}_axis.csv").write_text(f"Position [mm],1+ [um],1- [um],2+ [um],2- [um]\n{rows}\n")
-    assert "2 tests of an axis are in this folder" in open_folder(tmp_path, tmp_path).remarks[0]
