@@ -6,7 +6,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 # The tests start the program a hundred times; without its bytecode each would compile all of it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test tests readme quick docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
+.PHONY: demo test tests readme quick docs screenshots pictures soak benchmarks speeds lint mutants audit lock kernels clean
 
 $(VENV)/.run: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "thermofuse needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.12"; exit 1; }
@@ -59,6 +59,10 @@ docs: $(VENV)/.docs $(VENV)/.test
 # The pictures of README and documentation, from the demo's report in a headless Chromium.
 screenshots: $(VENV)/.test demo
 	$(BIN)/python docs/pictures/take.py build/demo/results build/demo docs/pictures
+
+# Whether each of them still shows what its page says.
+pictures: $(VENV)/.test demo
+	$(BIN)/python docs/pictures/take.py build/demo/results build/demo docs/pictures --check
 
 # Long simulations: the figures that the documentation quotes come from here.
 soak: $(VENV)/.test

@@ -605,7 +605,9 @@ def iso230(
                 _wide().print(table)
             _print_lines([*sentences("decided_how", found.part), *found.remarks])
         if out is not None:
-            sheet = describe_sheet(found.title, found.part, files=found.files, version=versions()["thermofuse"])
+            sheet = describe_sheet(
+                found.title, found.part, files=found.files, version=versions()["thermofuse"], own=found.sheet
+            )
             write_iso230(out, sheet, found.part, found.dataset, remarks=found.remarks)
             errors.print(f"page: {out.resolve()}")
 
@@ -617,6 +619,7 @@ def verify(
     ],
     after: Annotated[Path, Argument(metavar="AFTER.toml", help="Campaign file of the test with the compensation.")],
     applied: Annotated[Path, Option(metavar="MODEL.json", help="The model that the control runs.")],
+    out: Annotated[Path | None, Option(help="Write the sheet to sign: sheet.html, .pdf or .docx.")] = None,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Compare the test after a compensation with what was predicted.
@@ -626,20 +629,26 @@ def verify(
     """
     from dataclasses import asdict
 
+    from fusion.common import versions
     from fusion.pipeline.plan import verify_compensation
     from fusion.report.campaign import verification_table
+    from fusion.report.sheet import write_verification
+    from fusion.report.wording import print_table
 
     with _answering():
         found = verify_compensation(before, after, applied)
         if as_json:
-            print_json(asdict(found))
+            print_json({key: value for key, value in asdict(found).items() if key != "test"})
         else:
-            _wide().print(
-                verification_table(found.channels, title=f"{found.before}, then {found.after}: range of the drift")
-            )
+            title = f"{found.before}, then {found.after}: range of the drift"
+            _wide().print(print_table(verification_table(found.channels), title))
             _print_lines(
                 [*(f"{one.name}: {one.fault}: {one.reason}" for one in found.channels if one.fault), *found.remarks]
             )
+        if out is not None:
+            told = (found.test.conditions, found.test.files, found.test.sheet)
+            write_verification(out, found.after, found.channels, found.remarks, *told, version=versions()["thermofuse"])
+            errors.print(f"page: {out.resolve()}")
         _end_unless(all(one.is_kept for one in found.channels))
 
 
@@ -665,7 +674,7 @@ def iso230_3(
     from fusion.report.sheet import write_thermal_tests
 
     with _answering():
-        title, tests, files = read_thermal_tests(test)
+        title, tests, files, own = read_thermal_tests(test)
         if as_json:
             print_json([one.model_dump(mode="json") for one in tests])
         else:
@@ -673,7 +682,7 @@ def iso230_3(
                 _wide().print(table)
             _print_lines(dict.fromkeys(line for one in tests for line in one.remarks))
         if out is not None:
-            write_thermal_tests(out, title, tests, files=files, version=versions()["thermofuse"])
+            write_thermal_tests(out, title, tests, files=files, version=versions()["thermofuse"], own=own)
             errors.print(f"page: {out.resolve()}")
 
 

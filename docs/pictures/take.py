@@ -1,20 +1,27 @@
-"""Take the pictures of README and site: ``python docs/pictures/take.py RESULTS CAMPAIGN_FOLDER PICTURES`` (`make screenshots`)."""
+"""Take the pictures of README and site: ``python docs/pictures/take.py RESULTS CAMPAIGN_FOLDER PICTURES`` (`make screenshots`).
+
+Each holds a digest of what its page said when it was taken, without numbers. With ``--check`` (`make pictures`) nothing is written, and
+pictures whose pages say something else by now are named.
+"""
 
 from __future__ import annotations
 
 import io
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from PIL.PngImagePlugin import PngInfo
+from playwright.sync_api import Browser, Locator, Page, sync_playwright
 
 from fusion.campaign.remote import fetch_sample, read_registry
 from fusion.pipeline.run import run_campaign
@@ -27,12 +34,29 @@ _WIDTH = 1200
 _LOADING_MS = 120_000
 
 
-def compact(picture: bytes) -> bytes:
+#: Whether pictures are compared in place of written, and those that are stale.
+_CHECKS = "--check" in sys.argv
+_stale: list[str] = []
+_SHOWS = "shows"
+
+
+def keep(path: Path, shown: Page | Locator) -> None:
+    """Write a picture of a page, or of a part of it, or compare what the part says with what it said when the picture was taken."""
+    part = shown.locator("body") if isinstance(shown, Page) else shown
+    said = sha256(re.sub(r"[^A-Za-z]+", " ", part.aria_snapshot()).encode()).hexdigest()
+    if not _CHECKS:
+        path.write_bytes(compact(shown.screenshot(), said))
+    elif not path.is_file() or Image.open(path).info.get(_SHOWS) != said:
+        _stale.append(path.name)
+
+
+def compact(picture: bytes, said: str) -> bytes:
     """Return a small PNG: with all colours, or with a palette of its own where that is too large."""
-    image = Image.open(io.BytesIO(picture)).convert("RGB")
+    image, info = Image.open(io.BytesIO(picture)).convert("RGB"), PngInfo()
+    info.add_text(_SHOWS, said)
     for kept in (image, image.quantize(256, dither=Image.Dither.NONE)):
         small = io.BytesIO()
-        kept.save(small, "PNG", optimize=True)
+        kept.save(small, "PNG", optimize=True, pnginfo=info)
         if small.tell() < _MOST_BYTES:
             return small.getvalue()
     raise SystemExit(f"a picture of {image.size} px is larger than {_MOST_BYTES} bytes; take less of the page")
@@ -66,7 +90,7 @@ def take_report(browser: Browser, report: Path, folder: Path, parts: Mapping[str
             page.wait_for_load_state("networkidle")
             page.wait_for_timeout(2000)
             shown = page if place == "body" else page.locator(place).first
-            (folder / f"{name}.png").write_bytes(compact(shown.screenshot()))
+            keep(folder / f"{name}.png", shown)
 
 
 def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> None:
@@ -79,13 +103,12 @@ def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> N
             page.set_default_timeout(_LOADING_MS)
             page.get_by_text("Results", exact=True).first.click()
             page.get_by_text("Open", exact=True).first.click()
+            page.get_by_role("button", name="Map", exact=True).click()
             page.locator("canvas:visible").first.wait_for()
             page.wait_for_timeout(8000)
-            page.get_by_text("Position shown everywhere").evaluate(
-                "element => element.scrollIntoView({block: 'start'})"
-            )
+            page.get_by_role("slider").first.evaluate("element => element.scrollIntoView({block: 'start'})")
             page.wait_for_timeout(1000)
-            (folder / "app.png").write_bytes(compact(page.screenshot()))
+            keep(folder / "app.png", page)
     finally:
         shutil.rmtree(copy.parent)
 
@@ -143,11 +166,11 @@ def take_table(browser: Browser, folder: Path) -> None:
             place.wait_for()
             place.evaluate("element => element.scrollIntoView({block: 'start'})")
             page.wait_for_timeout(3000)
-            (folder / "table.png").write_bytes(compact(page.screenshot()))
+            keep(folder / "table.png", page)
 
 
 if __name__ == "__main__":
-    results, campaign, pictures = map(Path, sys.argv[1:4])
+    results, campaign, pictures = (Path(one) for one in sys.argv[1:] if not one.startswith("--"))
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         take_report(browser, results / "report.html", pictures)
@@ -156,3 +179,7 @@ if __name__ == "__main__":
         take_thermograms(browser, pictures)
         take_gallery(browser, pictures)
         browser.close()
+    if _stale:
+        raise SystemExit(
+            f"pages say something else than their pictures: {', '.join(_stale)}; make screenshots takes them again"
+        )

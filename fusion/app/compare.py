@@ -8,26 +8,13 @@ from pathlib import Path
 
 import panel as pn
 
-from fusion.analysis.comparison import PairComparison
 from fusion.app import parts as ui
-from fusion.app.results.charts import shown_if, table_of
 from fusion.campaign.values import in_order
 from fusion.common import FusionError
 from fusion.pipeline.compare import compare_campaigns
-from fusion.report.charts.comparison import draw_trend, follow_trends, plot_profiles, plot_remaining, plot_scatters
-from fusion.report.comparison import (
-    campaign_names,
-    changes_table,
-    compared_tests,
-    comparison_notes,
-    conclude_comparison,
-    describe_places,
-    short_names,
-    side_by_side,
-    trend_caption,
-    trend_notes,
-)
+from fusion.report.comparison import render_comparison
 from fusion.results.results import read_results
+from fusion.results.store import write_atomically
 
 #: Folders below the one of the application in which results are looked for, and most results that are listed.
 _DEPTH, _MOST = 4, 200
@@ -117,38 +104,16 @@ class CompareScreen:
             return
         with ui.disabled_during(self._compare), ui.telling(self._found):
             folders, same = [self._reference.value, *others], bool(self._same.value)
-            pairs = await asyncio.to_thread(lambda: compare_campaigns(folders, same_setup=same))
-            ui.schedule_parts(self._found, comparison_parts(pairs))
+            page = await asyncio.to_thread(lambda: write_comparison(folders, same_setup=same))
+            address = ui.report_link(self._state.root, page.parent, page.name)
+            link = ui.link("Open the comparison in a tab of its own", address)
+            ui.schedule_parts(self._found, [link, ui.frame("Comparison", address)])
 
 
-def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:
-    """Return a comparison as parts of a screen: what changed first, then the figures side by side, charts, and every quantity."""
-    names, short, tests = campaign_names(pairs), short_names(pairs), compared_tests(pairs)
-    compared = list(zip(names[1:], pairs, strict=True))
-    parts: ui.Parts = []
-    for name, pair in compared:
-        parts += [ui.heading(f"From {names[0]} to {name}", level=3), ui.paragraph(conclude_comparison(pair))]
-    parts += [ui.paragraph(note) for note in comparison_notes(pairs)]
-    figures = table_of(side_by_side(pairs), "Figures of every test, expanded uncertainties (k = 2)")
-    parts += [ui.heading("Side by side", level=3), figures]
-    profiles = "Drift-free profiles, mean of both approaches, each about its mean, with 95 % bands."
-    parts += shown_if(plot_profiles(tests, short), profiles)
-    parts += shown_if(plot_scatters(tests, short), "Scatter of single readings with 95 % limits.")
-    trends = follow_trends(pairs)
-    for trend in trends:
-        parts += shown_if(draw_trend(trend), f"{trend_caption(trend)} {trend_notes(pairs, trends)}".strip())
-    for name, pair in compared:
-        left = f"{name} minus {names[0]}, beyond offset, slope and bow, with 95 % intervals; ringed or shaded: changed."
-        parts += shown_if(plot_remaining(pair), left)
-        if pair.places is not None:
-            found = describe_places(pairs, pair)
-            parts += [ui.heading("Places that the drift follows", level=3), ui.paragraph(" ".join(found["said"]))]
-            if found["table"].rows:
-                parts.append(table_of(found["table"], "Sources that either test shows"))
-        if pair.changes:
-            every = f"Everything that was compared, {names[0]} before and {name} after"
-            parts.append(table_of(changes_table(pairs, pair), every))
-    return parts
+def write_comparison(folders: list[Path], *, same_setup: bool) -> Path:
+    """Write the page of a comparison into the results folder of the reference, in place of the one before."""
+    page = render_comparison(compare_campaigns(folders, same_setup=same_setup))
+    return write_atomically(folders[0] / "comparison.html", lambda part: part.write_text(page, encoding="utf-8"))
 
 
 def compare_screen(state: ui.State) -> pn.viewable.Viewable:

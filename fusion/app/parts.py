@@ -174,6 +174,7 @@ def file_name(written: str) -> str:
 #: Files of a results folder that the application sends, with their types.
 _SENT = {
     "report.html": "text/html; charset=utf-8",
+    "comparison.html": "text/html; charset=utf-8",
     "report.pdf": "application/pdf",
     "sheet.pdf": "application/pdf",
     "sheet.docx": "application/vnd.openxmlformats-officedocument.wordprocessingml.document",

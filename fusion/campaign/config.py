@@ -1007,6 +1007,35 @@ class AcceptTable(Table, title="Doubts that are settled"):
     )
 
 
+#: Endings of the files that make a sheet a laboratory's own.
+_OF_SHEET = {"logo": (".png", ".jpg", ".jpeg"), "word_template": (".docx",), "page_template": (".html", ".htm")}
+
+
+class SheetTable(Table, title="The sheet to sign: head, templates and language"):
+    """``[sheet]``: what makes the sheet that of a laboratory; its language is that of the report's first screen, too."""
+
+    head: str = key("", "Head of the sheet", example="Example Laboratory; Street 1; Town", about="a line for each ;")
+    logo: ExistingFile | None = key(None, "Logo", example="logo.png", about="PNG or JPEG, beside the head")
+    word_template: ExistingFile | None = key(
+        None, "Template of the sheet in Word", example="letterhead.docx", about="its header, footer and styles are kept"
+    )
+    page_template: ExistingFile | None = key(
+        None,
+        "Template of the sheet as page and PDF",
+        example="letterhead.html",
+        about="HTML in which {{ sheet }} stands",
+    )
+    language: Literal["en", "de"] = key("en", "Language", choices={"en": "English", "de": "German"})
+
+    @model_validator(mode="after")
+    def _files_are_of_their_kind(self) -> SheetTable:
+        for name, endings in _OF_SHEET.items():
+            written = getattr(self, name)
+            if written and Path(written).suffix.lower() not in endings:
+                raise ValueError(f"{name} = {written}: its name has to end in {' or '.join(endings)}")
+        return self
+
+
 class Campaign(Table):
     """A checked campaign file. Paths are absolute; every number is in the unit that its name states."""
 
@@ -1022,6 +1051,7 @@ class Campaign(Table):
     accept: AcceptTable = AcceptTable()
     acceptance: AcceptanceTable = key(AcceptanceTable(), of=_AXIS)
     report: ReportTable = ReportTable()
+    sheet: SheetTable = SheetTable()
     thermal_test: ThermalTestTable = ThermalTestTable()
 
     @model_validator(mode="before")

@@ -217,6 +217,7 @@ FILE_KEYS: Mapping[str, tuple[str, ...]] = {
     "sensors": ("file", "places"),
     "drivers": ("file",),
     "record": ("file", "files", "test"),
+    "sheet": ("logo", "word_template", "page_template"),
 }
 #: Folders of a pattern, each of which is searched within the one before.
 _MAX_PARTS = 64

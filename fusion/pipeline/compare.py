@@ -36,11 +36,9 @@ from fusion.results.store import (
     file_sha256,
     group,
     has,
-    opened,
     read_fusion,
     read_json_object,
-    require_kind,
-    require_own,
+    read_product,
     write_dataset,
     write_json,
     write_text,
@@ -79,7 +77,7 @@ def read_campaign(folder: Path) -> ComparedCampaign:
     """Read what a comparison needs of a results folder; the fields of the camera are not read."""
     results = read_results(folder)
     maps = None if results.correlation is None else read_fusion(folder).children.get("correlation")
-    drift = _drift(folder / "deviations.nc")
+    drift = _drift(folder)
     return ComparedCampaign(results, file_sha256(folder / "results.json"), _axis(folder), drift, maps)
 
 
@@ -91,16 +89,12 @@ def _axis(folder: Path) -> str:
         return ""
 
 
-def _drift(path: Path) -> xr.Dataset | None:
+def _drift(folder: Path) -> xr.Dataset | None:
     """Return the joint estimate of deviations.nc with its positions; of what belongs to single readings the drift alone."""
-    if not path.is_file():
+    if not (folder / "deviations.nc").is_file() or not has(read := read_product(folder, "deviations"), "estimate"):
         return None
-    require_own(path.parent, [path.name])
-    with opened(path) as stored:
-        if not has(require_kind(stored, "deviations", path), "drift"):
-            return None
-        drift = group(stored, "drift").assign(position=stored["position"])
-        return drift.drop_vars([name for name in drift if "cycle" in drift[name].dims and name != "drift"]).load()
+    drift = group(read, "estimate").assign(position=read["position"])
+    return drift.drop_vars([name for name in drift if "cycle" in drift[name].dims and name != "drift"])
 
 
 # Two campaigns that `thermofuse run` ran: joint.json, joint.nc, the page joint.html, and what both agree on in either report.

@@ -18,13 +18,16 @@ from fusion.campaign.config import (
     CampaignError,
     InterferometryTable,
     ReportTable,
+    SheetTable,
     load_campaign,
 )
 from fusion.campaign.inputs import cycles_within, is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.campaign.schema import Key, keys_of
 from fusion.campaign.time_zones import is_dated, shown_zone
-from fusion.campaign.values import QuantityError, read_cycles
+from fusion.campaign.values import QuantityError, read_cycles, stored_path
+from fusion.pipeline.resume import noted_campaign
+from fusion.report.letterhead import PLAIN, Letterhead
 from fusion.results.axis import Iso230Contribution, Iso230Part, Iso230Range, Iso230Window, Iso230WithTable
 from fusion.results.numbers import exact, moment
 from fusion.results.parts import Iso230Condition, Iso230Tolerance, Quantity, decide, is_determined
@@ -215,7 +218,7 @@ def complete_sheet(
     cycles = part.cycles
     report = ReportTable() if campaign is None else campaign.report
     limits = (AcceptanceTable() if campaign is None else campaign.acceptance).limits()
-    settling = estimate_settling(dataset, group(dataset, "drift")) if has(dataset, "drift") else None
+    settling = estimate_settling(dataset, group(dataset, "estimate")) if has(dataset, "estimate") else None
     checks = check_conditions(dataset, cycles=cycles, lead_mm=report.screw_lead_mm, settling=settling)
     others = [] if is_rotary(dataset) else evaluate_other_standards(dataset, cycles=cycles)
     windows = _of_standard(group(dataset, "iso"))
@@ -371,6 +374,7 @@ class StandardTest:
     dataset : readings; the group ``quoted`` holds the quoted window
     remarks : what was left out or assumed when the file was read
     files : SHA-256 of the files that it was read from, by name
+    sheet : head, templates and language of the sheet, with the paths of its files
     """
 
     title: str
@@ -378,6 +382,7 @@ class StandardTest:
     dataset: xr.Dataset
     remarks: tuple[str, ...]
     files: dict[str, str]
+    sheet: Letterhead = PLAIN
 
 
 def read_test(path: Path, cycles: str | None) -> StandardTest:
@@ -423,7 +428,8 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
         raise CampaignError(
             f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"
         )
-    return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset), files_of_run(folder))
+    read = (_remarks(dataset), files_of_run(folder), sheet_of_run(folder))
+    return StandardTest(results.campaign, results.iso230, dataset, *read)
 
 
 def _remarks(deviations: xr.Dataset) -> tuple[str, ...]:
@@ -441,6 +447,26 @@ def files_of_run(folder: Path) -> dict[str, str]:
     known: dict[str, Any] = inputs if is_file_list(inputs) else {}
     measured = {name: str(item["sha256"]) for name, item in known.items() if name in readings}
     return {**measured, **hashed({"results.json": folder / "results.json"})}
+
+
+def sheet_of_run(folder: Path) -> Letterhead:
+    """Return what makes the sheet of a run a laboratory's own, as its campaign file stated it, with the paths of its files."""
+    parameters, campaign = read_json_object(folder / "provenance.json").get("parameters"), noted_campaign(folder)
+    stated = parameters.get("sheet", {}) if isinstance(parameters, dict) else {}
+    table = SheetTable.model_validate({key: value for key, value in stated.items() if key in SheetTable.model_fields})
+    return sheet_files(table, folder.parent if campaign is None else campaign.parent)
+
+
+def sheet_files(table: SheetTable, folder: Path) -> Letterhead:
+    """Return what a campaign file in `folder` states of its sheet, with the paths of the files."""
+    paths: dict[str, str] = {}
+    for name in ("logo", "word_template", "page_template"):
+        if written := getattr(table, name):
+            path = stored_path(folder, written)
+            if not path.is_file():
+                raise CampaignError(f"{path}: no such file; put it back, or take {name} out of [sheet] and run again")
+            paths[name] = str(path)
+    return Letterhead(**{**table.model_dump(), **paths})
 
 
 def hashed(files: Mapping[str, Path]) -> dict[str, str]:
@@ -462,9 +488,10 @@ def _evaluate(
     without = lacks_course(deviations)
     remarks = (*_remarks(deviations), *(notice.message for notice in digits), *([without] if without else []))
     windows, quoted, found = evaluate_standard(deviations, budget, drift=drift, environment=environment, cycles=cycles)
-    dataset = joined(deviations, iso=windows, quoted=quoted, **({} if drift is None else {"drift": drift}))
+    dataset = joined(deviations, iso=windows, quoted=quoted, **({} if drift is None else {"estimate": drift}))
     found = complete_sheet(found, dataset, campaign=campaign, environment=environment)
-    return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks, hashed(files))
+    own = PLAIN if campaign is None else sheet_files(campaign.sheet, campaign.folder)
+    return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks, hashed(files), own)
 
 
 def _window_of(text: str, deviations: xr.Dataset, file: str) -> list[int]:

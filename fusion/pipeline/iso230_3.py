@@ -20,7 +20,16 @@ from fusion.campaign.inputs import read_laser, read_record
 from fusion.campaign.schema import keys_of
 from fusion.campaign.time_zones import shown_zone
 from fusion.common import Array
-from fusion.pipeline.iso230 import date_of, estimate_joint, files_of_run, hashed, state_conditions
+from fusion.pipeline.iso230 import (
+    date_of,
+    estimate_joint,
+    files_of_run,
+    hashed,
+    sheet_files,
+    sheet_of_run,
+    state_conditions,
+)
+from fusion.report.letterhead import PLAIN, Letterhead
 from fusion.results.parts import Quantity, TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
 from fusion.results.results import read_results
 from fusion.results.store import group, has
@@ -314,7 +323,7 @@ def thermal_tests(campaign: Campaign, measured: SensorHealth | xr.Dataset) -> tu
         ]
     else:
         table = measured
-        drift = group(table, "drift") if has(table, "drift") else estimate_joint(table)[0]
+        drift = group(table, "estimate") if has(table, "estimate") else estimate_joint(table)[0]
         tests = evaluate_axis_test(table, drift, stated_test)
     zone = shown_zone(table, campaign.zone_of("interferometry" if campaign.record is None else "record"))
     date, keys = date_of(table["time"].values, zone), keys_of("report", of="record")
@@ -323,11 +332,14 @@ def thermal_tests(campaign: Campaign, measured: SensorHealth | xr.Dataset) -> tu
 
 
 class StatedTests(NamedTuple):
-    """Tests by ISO 230-3: their title, they themselves, and the SHA-256 of the files that they were read from, by name."""
+    """Tests by ISO 230-3: their title, they themselves, the SHA-256 of the files that they were read from, by name, and what makes their
+    sheets a laboratory's own.
+    """
 
     title: str
     tests: tuple[ThermalTest, ...]
     files: dict[str, str]
+    sheet: Letterhead = PLAIN
 
 
 def read_thermal_tests(path: Path) -> StatedTests:
@@ -336,7 +348,7 @@ def read_thermal_tests(path: Path) -> StatedTests:
         results = read_results(path)
         if not results.iso230_3:
             raise CampaignError(f"{path}: these results hold no test by ISO 230-3, which needs {_NEEDS}")
-        return StatedTests(results.campaign, results.iso230_3, files_of_run(path))
+        return StatedTests(results.campaign, results.iso230_3, files_of_run(path), sheet_of_run(path))
     if path.suffix != ".toml":
         raise CampaignError(
             f"{path}: name a campaign file or a results folder; thermofuse init writes a campaign file for a table"
@@ -350,4 +362,5 @@ def read_thermal_tests(path: Path) -> StatedTests:
         found = thermal_tests(campaign, read_laser(campaign)["deviations"])
     if not found:
         raise CampaignError(f"{path}: a test by ISO 230-3 needs {_NEEDS}")
-    return StatedTests(campaign.campaign.title, found, hashed({path.name: path, **campaign.files_of(of)}))
+    read = {path.name: path, **campaign.files_of(of)}
+    return StatedTests(campaign.campaign.title, found, hashed(read), sheet_files(campaign.sheet, campaign.folder))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -17,9 +18,13 @@ from fusion.analysis.drift_model.record_data import reduce_record
 from fusion.analysis.drift_model.verification import ChannelVerdict, verify
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.schema import keys_of
+from fusion.campaign.time_zones import shown_zone
 from fusion.campaign.values import read_option
+from fusion.report.letterhead import Letterhead
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import duration
+from fusion.results.parts import Iso230Condition
 from fusion.results.recursion import read_recursion
 from fusion.results.results import read_results
 from fusion.results.store import file_sha256, read_product
@@ -152,17 +157,28 @@ class Verification:
     before, after : titles of the campaigns
     channels : one verdict per displacement that is corrected
     remarks : what to know, one sentence each
+    test : what the sheet says of the test after
     """
 
     before: str
     after: str
     channels: tuple[ChannelVerdict, ...]
     remarks: tuple[str, ...]
+    test: StatedTest
+
+
+class StatedTest(NamedTuple):
+    """Conditions of a test, the SHA-256 of the files that a sheet rests on, and what makes the sheet a laboratory's own."""
+
+    conditions: tuple[Iso230Condition, ...]
+    files: dict[str, str]
+    sheet: Letterhead
 
 
 def verify_compensation(before: Path, after: Path, applied: Path) -> Verification:
     """Compare a test with an active compensation with what the results before it predicted."""
     from fusion.campaign.inputs import read_record  # loads both instruments, which no plan needs
+    from fusion.pipeline.iso230 import date_of, hashed, sheet_files, state_conditions
 
     if applied.suffix.lower() != ".json":
         raise CampaignError(
@@ -195,9 +211,17 @@ def verify_compensation(before: Path, after: Path, applied: Path) -> Verificatio
         remarks.append(
             f"For most of the test outside the range of the model, where it holds its correction: {', '.join(outside)}."
         )
+    date = date_of(table["time"].values, shown_zone(table, campaign.zone_of("record")))
+    stated = campaign.report.model_dump(by_alias=True)
+    files = {f"{before.name}/results.json": before / "results.json", applied.name: applied, after.name: after}
     return Verification(
         results.campaign,
         campaign.campaign.title,
         tuple(verify(read_product(before, "record"), results.loop, record, model, faulty_sensors=faulty)),
         tuple(remarks),
+        StatedTest(
+            state_conditions(keys_of("report", of="record"), stated, date, campaign.campaign.axis, {}),
+            hashed({**files, **campaign.files_of("record")}),
+            sheet_files(campaign.sheet, campaign.folder),
+        ),
     )

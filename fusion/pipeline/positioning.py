@@ -55,7 +55,7 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
             pair_s_um=by_direction(comparison["differenced"]),
             ratio=by_direction(comparison["ratio"]),
         )
-    groups |= {} if drift is None else {"drift": drift}
+    groups |= {} if drift is None else {"estimate": drift}
     dataset = joined(deviations, **groups)
     zone = shown_zone(deviations, source.campaign.zone_of("interferometry"))
     if not np.isnat(times).all():
@@ -154,7 +154,7 @@ def _sensor_notices(fused: xr.Dataset) -> Iterator[Notice]:
 
 def _without_gross(deviations: xr.Dataset, zone: str | None) -> tuple[xr.Dataset, list[Notice]]:
     """Return the readings without those that are errors of reading, and a notice of these."""
-    gross = find_gross_readings(group(deviations, "drift")["standardised"])
+    gross = find_gross_readings(group(deviations, "estimate")["standardised"])
     if not gross.any():
         return deviations, []
     deviation, named = deviations["deviation"], _names(gross, deviations, zone)

@@ -30,9 +30,11 @@ from fusion.results.store import (
     annotate,
     digest,
     file_sha256,
+    in_groups,
     is_file_list,
     open_dataset,
     read_dataset,
+    read_grouped,
     read_json_object,
     read_tree,
     retitle,
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
 # there already.
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
-PRODUCT_LAYOUT = 7
+PRODUCT_LAYOUT = 8
 #: The stamp of a whole run, which its last stage gets.
 _REPORT = "report"
 
@@ -245,7 +247,7 @@ _MODELLED = ("plan", "interferometry", "sensors", "drivers", "model")
 STAGES = {
     "thermograms": Stage("thermograms", "thermograms.nc", ("thermography", "plan"), (), read_dataset),
     "fields": Stage("thermal fields", "fields.nc", ("thermography", "plan"), (), open_dataset),
-    "deviations": Stage("deviations", "deviations.nc", ("interferometry",), ("fields",), read_dataset),
+    "deviations": Stage("deviations", "deviations.nc", ("interferometry",), ("fields",), read_grouped),
     "correlation": Stage("correlation", ".stages/correlation.nc", _CORRELATED, ("fields", "deviations"), read_tree),
     "model": Stage("anomalies and closed loop", ".stages/model.nc", _MODELLED, ("fields", "deviations"), read_dataset),
     "record": Stage("closed loop on the record", "fusion.nc", ("record", "model"), (), read_dataset),
@@ -361,7 +363,7 @@ class Run:
             computed, spent_s = compute()
             begun = time.monotonic()
             outcome = replace(computed, dataset=self.described(computed.dataset))
-            write_dataset(path, outcome.dataset)
+            write_dataset(path, in_groups(outcome.dataset) if name == "deviations" else outcome.dataset)
             found = {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
             self.stamps.record(name, key, [path], found)
             del computed

@@ -22,7 +22,8 @@ from fusion.analysis.levels import (
     SEARCH_LEVEL,
     SECOND_LEVEL,
 )
-from fusion.report.findings import findings, first_screen, headline, next_steps, sharpen
+from fusion.report.findings import Tile, findings, first_screen, headline, next_steps, sharpen
+from fusion.report.letterhead import translation
 from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
     ARROWS,
@@ -286,9 +287,9 @@ def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict
 
 def _scatter_um(part: Iso230Part, dataset: xr.Dataset | None) -> float | None:
     """Return the median scatter of the readings without drift, of a test whose first window stands beside the quoted one."""
-    if dataset is None or not has(dataset, "drift") or _other_first(part) is None:
+    if dataset is None or not has(dataset, "estimate") or _other_first(part) is None:
         return None
-    return float(group(dataset, "drift")["scatter"].median())
+    return float(group(dataset, "estimate")["scatter"].median())
 
 
 def _other_first(part: Iso230Part) -> Iso230Window | None:
@@ -645,6 +646,16 @@ _ERRORS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
 MOST_STEPS = 6
 
 
+def _in_language(language: str, first: Mapping[str, Any], tiles: Sequence[Tile]) -> dict[str, Any]:
+    """Return the first screen in a language, with what translates its headings."""
+    tell = translation(language)
+    words = {
+        key: [*map(tell, text)] if key == "next" else tell(text) for key, text in first.items() if key != "identity"
+    }
+    shown = [Tile(*map(tell, one)) for one in tiles]
+    return {"language": language, "tell": tell, "first_screen": {**first, **words}, "tiles": shown}
+
+
 def describe_campaign(
     results: Results, provenance: Mapping[str, Any], datasets: Mapping[str, Any], joint: Mapping[str, Any] | None
 ) -> dict[str, Any]:
@@ -673,8 +684,11 @@ def describe_campaign(
         "unverified": results.inputs.unverified if results.inputs else (),
         "untouched": untouched(results.inputs, figures),
         "assumptions": {one.at: assumption(results.inputs, one.rests_on) for one in SECTIONS if one.rests_on},
-        "first_screen": first_screen(results, stated.get("report", {}), axis, moment(begun[0], zone) if begun else ""),
-        "tiles": [one.tile for one in findings(results) if one.tile],
+        **_in_language(
+            (stated.get("sheet") or {}).get("language", "en"),
+            first_screen(results, stated.get("report", {}), axis, moment(begun[0], zone) if begun else ""),
+            [one.tile for one in findings(results) if one.tile],
+        ),
         "next": next_steps(results)[:MOST_STEPS],
         "thermograms": describe_thermograms(results, datasets["thermograms"]) if "thermograms" in datasets else None,
         "drift_stated": (stated.get("thermography") or {}).get("camera_drift_u_K") is not None,
@@ -797,7 +811,7 @@ def _camera(fields: xr.Dataset) -> dict[str, Any]:
 
 def _positions_table(deviations: xr.Dataset) -> Table:
     """Return profile, scatter and conventional standard deviation of every position and approach."""
-    drift, conventional = group(deviations, "drift"), group(deviations, "conventional")
+    drift, conventional = group(deviations, "estimate"), group(deviations, "conventional")
     decimals = {name: decimals_of(float(drift[f"{name}_u"].median())) for name in ("profile", "scatter")}
     targets = deviations["target"].values
     laid = {name: by_approach(drift[name], target=targets) for key in decimals for name in (key, f"{key}_u")}
@@ -902,8 +916,8 @@ def thermal_test_tables(tests: Sequence[ThermalTest], *, title: str) -> list[ric
     ]
 
 
-def verification_table(verdicts: Sequence[ChannelVerdict], *, title: str) -> rich.table.Table:
-    """Return what was predicted and achieved for the terminal."""
+def verification_table(verdicts: Sequence[ChannelVerdict]) -> Table:
+    """Return what was predicted and achieved."""
     rows = [
         [
             one.name,
@@ -916,4 +930,4 @@ def verification_table(verdicts: Sequence[ChannelVerdict], *, title: str) -> ric
         for one in verdicts
     ]
     titles = ["without / µm", "predicted [95 %] / µm", "achieved / µm", "gain (k = 2)"]
-    return print_table(table([Words("Displacement"), *titles, Words("Verdict")], rows), title)
+    return table([Words("Displacement"), *titles, Words("Verdict")], rows)

@@ -83,6 +83,7 @@ def first_screen(results: Results, report: Mapping[str, Any], axis: str, begun: 
         "decision": decision,
         "unmet": "" if iso is None else say("unmet", iso),
         "cause": _if_so(say("why", results)),
+        "map": "" if results.field is None else say("map_in_brief", results),
         "open": still_open,
         "next": [in_brief(step) for step in next_steps(results)[: _FIRST_STEPS - bool(still_open)]],
     }
@@ -189,22 +190,25 @@ def _clock_doubted(results: Results) -> bool:
 
 
 def next_steps(results: Results) -> list[str]:
-    """Return what to do next: doubted inputs, what the loop found, positions that stand out, the place, remedies of the warnings."""
+    """Return what to do next: doubted inputs, what the loop found, positions, the place, then what to record and state, and warnings."""
     inputs = results.inputs
-    steps = [check.remedy for check in (*inputs.doubts, *inputs.unverified)] if inputs else []
+    steps = [check.remedy for check in inputs.doubts] if inputs else []
     loop, correlation = results.loop, results.correlation
+    # What is inspected on the machine comes before what is written or recorded.
+    records = []
     if loop is not None:
         # Where no cause is separable, none is to be looked for.
         shown = loop.steps if loop.separable else ()
         actions = [action(step, results.time, record=results.registration is None) for step in shown]
         steps += [conditional(one, inputs, "causes") for one in actions]
         if loop.warm_up_only:
-            steps.append(say("vary_load"))
+            records.append(say("vary_load"))
         if loop.verdict in {"partial", "unexplained", "no_skill"} and loop.separable and not _clock_doubted(results):
-            steps.append(say("log_more", loop.unexplained.shape))
+            records.append(say("log_more", loop.unexplained.shape))
     steps += [say("position_action", anomaly) for anomaly in results.anomalies or ()]
     if correlation is not None and correlation.verdict == "attributable":
         steps.append(say("test_place", correlation.source))
+    steps += records + [check.remedy for check in (inputs.unverified if inputs else ())]
     steps += [warning.remedy for warning in results.warnings]
     unique = list(dict.fromkeys(step for step in steps if step))
     if (sharper := sharpen(results.iso230)) is not None and sharper.line:
@@ -362,7 +366,12 @@ def brief_rows(results: Results) -> list[tuple[str, str]]:
     """Return names and texts of what the first screen of the report says."""
     first = first_screen(results, {}, "", "")
     steps = _numbered(first["next"])
-    rows = [("in doubt", first["open"]), ("decision", first["decision"]), ("cause", first["cause"])]
+    rows = [
+        ("in doubt", first["open"]),
+        ("decision", first["decision"]),
+        ("cause", first["cause"]),
+        ("map", first["map"]),
+    ]
     rows += [(one.tile.name, one.tile.value) for one in findings(results) if one.tile]
     return [(name, text) for name, text in (*rows, ("next", steps)) if text]
 

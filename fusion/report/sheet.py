@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,11 @@ import pandas as pd
 import rich.table
 import xarray as xr
 
-from fusion.report.campaign import DRAWN, describe_iso230, describe_thermal_tests, values_to_sign
+from fusion.report.campaign import DRAWN, describe_iso230, describe_thermal_tests, values_to_sign, verification_table
 from fusion.report.charts.readings import has_windows, plot_test, plot_windows
 from fusion.report.charts.record import draw_thermal_tests
 from fusion.report.charts.style import Chart, embed, of_rank
+from fusion.report.letterhead import PLAIN, Letterhead, Translate, translated, translation
 from fusion.report.page import page_format, render_page, write_page
 from fusion.report.wording import Table, Words, print_table, sentences, table
 from fusion.results.axis import Iso230Part
@@ -29,6 +30,8 @@ from thermography.common import ACTING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from fusion.analysis.drift_model.verification import ChannelVerdict
 
 #: The last condition that says whose test of which axis a sheet is of; the others follow the values.
 _LAST = "sign_convention"
@@ -76,12 +79,42 @@ class Sheet:
     requirements: Table
     files: Mapping[str, str]
     version: str
+    own: Letterhead = PLAIN
+
+    @property
+    def tell(self) -> Translate:
+        """What translates the words around it."""
+        return translation(self.own.language)
+
+    def in_its_language(self) -> Sheet:
+        """Return it in the language that is asked for; title, names and hashes stay as they are."""
+        tell = self.tell
+
+        def pairs(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+            return [(tell(name), tell(text)) for name, text in rows]
+
+        stated = Stated(
+            pairs(self.stated.identity),
+            pairs(self.stated.conditions),
+            [(tell(role), name) for role, name in self.stated.signatures],
+        )
+        return replace(
+            self,
+            standard=tell(self.standard),
+            stated=stated,
+            caption=tell(self.caption),
+            values=translated(self.values, tell),
+            notes=[*map(tell, self.notes)],
+            requirements=translated(self.requirements, tell),
+        )
 
 
-def describe_sheet(title: str, part: Iso230Part, *, files: Mapping[str, str], version: str) -> Sheet:
+def describe_sheet(
+    title: str, part: Iso230Part, *, files: Mapping[str, str], version: str, own: Letterhead | None = None
+) -> Sheet:
     """Return what the sheet of a test by ISO 230-2 shows."""
     requirements = [[check.name, _MET[check.met], check.evidence] for check in part.checks]
-    return Sheet(
+    shown = Sheet(
         title=title,
         standard="Accuracy and repeatability of positioning by ISO 230-2:2014",
         stated=Stated.of(part.conditions, _CONVENTION),
@@ -91,13 +124,17 @@ def describe_sheet(title: str, part: Iso230Part, *, files: Mapping[str, str], ve
         requirements=table([Words("Requirement of ISO 230-2"), Words("Met"), Words("Found")], requirements),
         files=files,
         version=version,
+        own=own or PLAIN,
     )
+    return shown.in_its_language()
 
 
-def describe_thermal_sheet(title: str, test: ThermalTest, *, files: Mapping[str, str], version: str) -> Sheet:
+def describe_thermal_sheet(
+    title: str, test: ThermalTest, *, files: Mapping[str, str], version: str, own: Letterhead = PLAIN
+) -> Sheet:
     """Return what the sheet of a test by ISO 230-3 shows."""
     (described,) = describe_thermal_tests([test])
-    return Sheet(
+    shown = Sheet(
         title=title,
         standard=f"Thermal effects by ISO 230-3:2020. {described['title']}",
         stated=Stated.of(test.conditions, "not stated"),
@@ -107,7 +144,39 @@ def describe_thermal_sheet(title: str, test: ThermalTest, *, files: Mapping[str,
         requirements=table([], []),
         files=files,
         version=version,
+        own=own,
     )
+    return shown.in_its_language()
+
+
+def write_verification(
+    path: Path,
+    title: str,
+    verdicts: Sequence[ChannelVerdict],
+    remarks: Sequence[str],
+    conditions: Sequence[Iso230Condition],
+    files: Mapping[str, str],
+    own: Letterhead,
+    *,
+    version: str,
+) -> None:
+    """Write the sheet of a test after a compensation, as found, predicted and achieved; nothing is replaced."""
+    shown = Sheet(
+        title=title,
+        standard="Drift without compensation, as predicted and as achieved with it",
+        stated=Stated.of(conditions, "not stated"),
+        caption="Range of the drift; predicted with 95 % interval",
+        values=verification_table(verdicts),
+        notes=[*(f"{one.name}: {one.fault}: {one.reason}" for one in verdicts if one.fault), *remarks],
+        requirements=table([], []),
+        files=files,
+        version=version,
+        own=own,
+    ).in_its_language()
+    if page_format(path, ".html", ".pdf", ".docx") == ".docx":
+        write_atomically(path, lambda temporary: _write_word(temporary, [(shown, None)]))
+    else:
+        write_page(path, render_page("verification.html.j2", {}, sheet=shown))
 
 
 def draw_iso230(dataset: xr.Dataset) -> dict[str, Chart]:
@@ -120,8 +189,16 @@ def draw_iso230(dataset: xr.Dataset) -> dict[str, Chart]:
 def render_iso230(sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> str:
     """Return the page of a test as HTML text: the sheet, then what it rests on."""
     summary = {"iso230": describe_iso230(part, dataset), "assumptions": {"iso230": ""}}
+    charts = draw_iso230(dataset)
+    _label(charts["iso230"], sheet.tell)
     shown = {"sheet": sheet, "iso230": part, "remarks": remarks, "summary": summary}
-    return render_page("iso230.html.j2", embed(draw_iso230(dataset)), **shown)
+    return render_page("iso230.html.j2", embed(charts), **shown)
+
+
+def _label(chart: Chart, tell: Translate) -> None:
+    """Name the axes of a chart in a language."""
+    for axis in (*chart.figure.xaxis, *chart.figure.yaxis):
+        axis.axis_label = tell(axis.axis_label)
 
 
 def write_iso230(path: Path, sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> None:
@@ -136,14 +213,23 @@ def write_iso230(path: Path, sheet: Sheet, part: Iso230Part, dataset: xr.Dataset
 def render_thermal_tests(sheets: Sequence[Sheet], tests: Sequence[ThermalTest]) -> str:
     """Return the page of tests by ISO 230-3 as HTML text: their sheets, then what they rest on."""
     summary = {"thermal_tests": describe_thermal_tests(tests), "assumptions": {"iso230-3": ""}}
-    return render_page("iso230_3.html.j2", embed(draw_thermal_tests(tests)), sheets=sheets, summary=summary)
+    charts = draw_thermal_tests(tests)
+    for chart in charts.values():
+        _label(chart, sheets[0].tell)
+    return render_page("iso230_3.html.j2", embed(charts), sheets=sheets, summary=summary)
 
 
 def write_thermal_tests(
-    path: Path, title: str, tests: Sequence[ThermalTest], *, files: Mapping[str, str], version: str
+    path: Path,
+    title: str,
+    tests: Sequence[ThermalTest],
+    *,
+    files: Mapping[str, str],
+    version: str,
+    own: Letterhead | None = None,
 ) -> None:
     """Write the sheets of tests by ISO 230-3 in the format of the file's name; nothing is replaced."""
-    sheets = [describe_thermal_sheet(title, one, files=files, version=version) for one in tests]
+    sheets = [describe_thermal_sheet(title, one, files=files, version=version, own=own or PLAIN) for one in tests]
     if page_format(path, ".html", ".pdf", ".docx") == ".docx":
         drawn = [(sheet, plot_thermal_test(test)) for sheet, test in zip(sheets, tests, strict=True)]
         write_atomically(path, lambda temporary: _write_word(temporary, drawn))
@@ -168,25 +254,34 @@ def plot_thermal_test(test: ThermalTest) -> Axes:
     return axes
 
 
-def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
+def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes | None]]) -> None:
     """Write sheets, one on each page, as a document of Word that a laboratory may complete with its own heading."""
     import docx
     from docx.shared import Mm, Pt
 
-    document = docx.Document()
-    page = document.sections[0]
-    page.page_width, page.page_height = Mm(210), Mm(297)
-    page.left_margin = page.right_margin = Mm(16)
-    page.top_margin = page.bottom_margin = Mm(12)
-    normal = document.styles["Normal"]
-    normal.font.name, normal.font.size, normal.paragraph_format.space_after = "Arial", Pt(7), Pt(0)
-
     # XML holds no control characters.
     clean = partial(ACTING.sub, " ")
+    own, tell = sheets[0][0].own, sheets[0][0].tell
+    document = docx.Document(own.word_template or None)
+    page = document.sections[0]
+    if not own.word_template:
+        page.page_width, page.page_height = Mm(210), Mm(297)
+        page.left_margin = page.right_margin = Mm(16)
+        page.top_margin = page.bottom_margin = Mm(12)
+        normal = document.styles["Normal"]
+        normal.font.name, normal.font.size, normal.paragraph_format.space_after = "Arial", Pt(7), Pt(0)
+    styles = {style.name for style in document.styles}
+    if own.logo:
+        page.header.paragraphs[0].add_run().add_picture(own.logo, height=Mm(12))
+    for line in own.lines:
+        page.header.add_paragraph(clean(line))
 
     def put(rows: Iterable[Sequence[str]], widths_mm: Sequence[int], titles: Sequence[str] = ()) -> None:
         every = [*([titles] if titles else []), *rows]
-        grid = document.add_table(rows=len(every), cols=len(every[0]), style="Table Grid")
+        # A template of a laboratory may lack the styles of the program's own.
+        grid = document.add_table(
+            rows=len(every), cols=len(every[0]), style="Table Grid" if "Table Grid" in styles else None
+        )
         grid.autofit = False
         for column, width in zip(grid.columns, widths_mm, strict=False):
             column.width = Mm(width)
@@ -199,17 +294,11 @@ def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
     for number, (sheet, axes) in enumerate(sheets):
         if number:
             document.add_page_break()
-        document.add_heading(clean(sheet.title), level=1)
+        document.add_paragraph(clean(sheet.title), style="Heading 1" if "Heading 1" in styles else None)
         document.add_paragraph(clean(sheet.standard))
         put(in_pairs(sheet.stated.identity), pairs)
-        drawn = axes.get_figure(root=True)
-        assert drawn is not None
-        picture = io.BytesIO()
-        with warnings.catch_warnings():
-            # A character that the font of charts lacks is a box there, and itself in the table below.
-            warnings.filterwarnings("ignore", "Glyph .* missing from font")
-            drawn.savefig(picture, format="png", dpi=200, transparent=False)
-        document.add_picture(picture, width=Mm(125))
+        if axes is not None:
+            document.add_picture(_picture(axes, tell), width=Mm(125))
         document.add_paragraph(sheet.caption)
         # The first column holds names, the others share what is left of the width.
         titles = sheet.values.titles
@@ -220,10 +309,23 @@ def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
             put([row.cells for row in sheet.requirements.rows], (44, 18, 116), sheet.requirements.titles)
         if sheet.stated.conditions:
             put(in_pairs(sheet.stated.conditions), pairs)
-        put([[f"{role}: {name}\n", "Date, signature:"] for role, name in sheet.stated.signatures], (89, 89))
+        put([[f"{role}: {name}\n", tell("Date, signature:")] for role, name in sheet.stated.signatures], (89, 89))
         hashes = "; ".join(f"{name} {sha256}" for name, sha256 in sheet.files.items())
         document.add_paragraph(clean(f"thermofuse {sheet.version}. SHA-256: {hashes}"))
     document.save(str(path))
+
+
+def _picture(axes: Axes, tell: Translate) -> io.BytesIO:
+    """Return a chart as a picture, with its axes named in a language."""
+    axes.set(xlabel=tell(axes.get_xlabel()), ylabel=tell(axes.get_ylabel()))
+    drawn = axes.get_figure(root=True)
+    assert drawn is not None
+    picture = io.BytesIO()
+    with warnings.catch_warnings():
+        # A character that the font of charts lacks is a box there, and itself in the table below.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        drawn.savefig(picture, format="png", dpi=200, transparent=False)
+    return picture
 
 
 def in_pairs(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str, str, str]]:

@@ -282,8 +282,8 @@ def read_results(folder: str | Path) -> Results:
 
     Notes
     -----
-    The products beside them are NetCDF: ``xarray.open_dataset("results/deviations.nc")``. There, ``drift_profile`` is ``profile`` of
-    `estimate_drift`, and so on with every part of that file.
+    The products beside them are NetCDF. ``xarray.open_datatree("results/deviations.nc")`` holds the readings, and in groups what functions
+    return: ``["estimate"]`` is the Dataset of `estimate_drift`, ``["quoted"]`` that of the ISO 230-2 window in the report.
 
     Examples
     --------

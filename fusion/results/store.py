@@ -410,7 +410,7 @@ def annotate(product: Product, *, title: str, history: str, provenance: str) -> 
 
 
 def name_in_words(name: str) -> str:
-    """Return a variable's name as words: ``"drift_profile_u"`` -> ``"standard uncertainty of drift profile"``."""
+    """Return a variable's name as words: ``"local_rise_u"`` -> ``"standard uncertainty of local rise"``."""
     words = name.removesuffix("_u").replace("_", " ")
     return f"standard uncertainty of {words}" if name.endswith("_u") else words
 
@@ -460,7 +460,7 @@ def read_product(folder: Path, name: str) -> xr.Dataset:
     """Read a product of a run into memory; large fields are left in their file, see `open_dataset`."""
     path = folder / ("fusion.nc" if name == "record" else f"{name}.nc")
     require_own(folder, [path.name])
-    read = open_dataset if name == "fields" else read_dataset
+    read = {"fields": open_dataset, "deviations": read_grouped}.get(name, read_dataset)
     return require_kind(read(path), name, path)
 
 
@@ -492,12 +492,30 @@ def _tuple(dims: tuple[object, ...]) -> str:
     return f"({', '.join(map(str, dims))})"
 
 
-# Several results on the axes of one Dataset, each behind a prefix: the parts of deviations.nc, and the closed loop in
+# Several results on the axes of one Dataset, each behind a prefix: the groups of deviations.nc, and the closed loop in
 # fusion.nc.
+
+#: Groups of deviations.nc.
+GROUPS = ("estimate", "iso", "quoted", "conventional", "neighbours", "comparison", "chart")
+
+
+def in_groups(dataset: xr.Dataset) -> xr.DataTree:
+    """Return the readings with their results as a tree: ``estimate_profile`` as ``profile`` of the group ``estimate``."""
+    import xarray as xr
+
+    parts = {name: group(dataset, name) for name in GROUPS if has(dataset, name)}
+    taken = [f"{name}_{key}" for name, part in parts.items() for key in part.data_vars]
+    return xr.DataTree.from_dict({"/": dataset.drop_vars(taken), **parts})
+
+
+def read_grouped(path: Path) -> xr.Dataset:
+    """Read a tree written by `in_groups` as the Dataset that it was."""
+    tree = read_tree(path)
+    return joined(tree.to_dataset(), **{name: node.to_dataset() for name, node in tree.children.items()})
 
 
 def joined(base: xr.Dataset, **parts: xr.Dataset) -> xr.Dataset:
-    """Return `base` with the data variables of several results, ``profile`` of ``drift`` as ``drift_profile``; coordinates as they are."""
+    """Return `base` with the data variables of several results, ``profile`` of ``estimate`` as ``estimate_profile``."""
     renamed = {f"{name}_{key}": array for name, part in parts.items() for key, array in part.data_vars.items()}
     return base.assign(renamed)
 

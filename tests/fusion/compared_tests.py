@@ -46,7 +46,7 @@ def drift_of(readings: xr.Dataset) -> xr.Dataset:
 def write_results(folder: Path, readings: xr.Dataset, *, title: str = "X axis", axis: str = "X", **parts: Any) -> Path:
     """Write what a comparison reads of a results folder."""
     drift = estimate_drift(readings)
-    write_dataset(folder / "deviations.nc", joined(readings, drift=drift))
+    write_dataset(folder / "deviations.nc", joined(readings, estimate=drift))
     found = {"iso230": PARTS["iso230"], "loop": PARTS["loop"], "anomalies": [], **parts}
     found["drift"] = {
         **PARTS["drift"], "position_mm": readings["position"].values, "range_um": drift["drift"].mean("direction").max("cycle").values,

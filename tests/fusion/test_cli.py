@@ -262,8 +262,12 @@ def test_a_record_is_explained_corrected_and_followed_by_the_next_test(spindle: 
     (tmp_path / "second.toml").write_text(second)
     assert invoke("simulate", tmp_path / "second.toml", "--out", tmp_path / "after").exit_code == 0
     after = tmp_path / "after" / "campaign.toml"
-    verified = invoke("verify", out, after, "--applied", model, "--json")
+    sheet = tmp_path / "sheet.html"
+    verified = invoke("verify", out, after, "--applied", model, "--json", "--out", sheet)
     assert verified.exit_code == 1, verified.output
+    assert {"predicted [95 %] / µm", "achieved / µm", "Date, signature"} <= set(
+        re.findall(r">([^<>]+)</(?:th|span)>", sheet.read_text(encoding="utf-8"))
+    )
     faults = [one["fault"] for one in json.loads(verified.stdout)["channels"]]
     assert faults == ["wrong sign"] * len(faults) and faults
     planned = invoke("plan", out)

@@ -93,7 +93,7 @@ def test_right_tables_and_planted_faults(cycles: int, drift_um: float) -> None:
         profile = axis(rng)
         first = measure(rng, profile, cycles=cycles, drift_um=drift_um)
         drift = estimate_drift(first)
-        whole = joined(first, drift=drift)
+        whole = joined(first, estimate=drift)
         before = drift.assign(position=first["position"])
         table = tabulate(read_profile(whole))
         found = predict_test(read_profile(whole), table, *scatter_and_drift(before), cycles=5, one_table=False)
@@ -158,7 +158,7 @@ def test_a_test_with_the_table_is_as_predicted(
         shown = profile - old.at(POSITION) if old else profile
         first = measure(np.random.default_rng(seed), shown, cycles=cycles, drift_um=drift_um)
         before = estimate_drift(first).assign(position=first["position"])
-        known = read_profile(joined(first, drift=before.drop_vars("position")))
+        known = read_profile(joined(first, estimate=before.drop_vars("position")))
         table = tabulate(known, active=old)
         stated = predict_test(known, table, *scatter_and_drift(before), cycles=5, one_table=one_table)
         left = shown - table.added_um(POSITION, one_table=one_table)
@@ -193,7 +193,7 @@ def test_the_sum_with_the_table_that_was_active_leaves_least() -> None:
         errors = axis(rng)
         active = an_old_table(rng, errors)
         first = measure(rng, errors - active.at(POSITION), cycles=10, drift_um=1.0)
-        known = read_profile(joined(first, drift=estimate_drift(first)))
+        known = read_profile(joined(first, estimate=estimate_drift(first)))
         table = tabulate(known, active=active)
         added, old_there = table.added_um(POSITION, one_table=False), active.at(POSITION)
         left = [errors - one for one in (old_there, added, old_there + added)]

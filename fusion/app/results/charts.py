@@ -1,8 +1,6 @@
-"""Charts of the report, linked: profile, drift, ISO 230-2, and the readings of the chosen position."""
+"""What the report has no room for: the readings of every position, and every cycle of the thermal map with places over time."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 import panel as pn
@@ -13,15 +11,12 @@ from bokeh.plotting import figure
 
 from fusion.app import parts as ui
 from fusion.app.drawings import keep_scale, shown_drawing
-from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Products, Selection
-from fusion.campaign.inputs import lacks_course
+from fusion.app.results.data import Place, Products, Selection
 from fusion.report.charts import readings
-from fusion.report.charts.plan import Layer, add_marks, draw_followed, draw_map, draw_places, extent_of
+from fusion.report.charts.plan import Layer, draw_followed, draw_map, draw_places, extent_of
 from fusion.report.charts.style import CATEGORIES, Chart, add_series, new_figure, of_rank, palette
-from fusion.report.wording import Table, caption, iso230_values, say
+from fusion.report.wording import caption, say
 from fusion.results.numbers import moment, number, place
-from fusion.results.store import group, has
-from interferometry.plots import ACCENT, hours_since_start
 
 
 def shown(chart: Chart, caption: str) -> pn.viewable.Viewable:
@@ -34,101 +29,19 @@ def shown_if(chart: Chart | None, caption: str) -> ui.Parts:
     return [] if chart is None else [shown(chart, caption)]
 
 
-def reading_hours(products: Products) -> np.ndarray | None:
-    """Return the mean time of the readings of every cycle, h since the first reading; None without times."""
-    read = products.deviations
-    if read is None or np.isnat(read["time"].values).all():
-        return None
-    return np.asarray(hours_since_start(read).mean(["direction", "target"]).values, float)
-
-
-def laser_charts(products: Products, selection: Selection, linker: Linker) -> ui.Parts:
-    """Return the charts of the readings, and say which are missing."""
-    assert products.deviations is not None
-    if products.drift is None:
-        untimed = "The readings have no times: profile and drift cannot be told apart and are not shown."
-        parts = [ui.note(lacks_course(products.deviations) or untimed)]
-    else:
-        parts = _drift_charts(products.deviations, products.drift, products, selection, linker)
-    return [*parts, *_standard_charts(products.deviations, products, linker)]
-
-
-def _drift_charts(
-    read: xr.Dataset, joint: xr.Dataset, products: Products, selection: Selection, linker: Linker
-) -> ui.Parts:
-    """Profile, drift over time, drift as a map, and the readings of the chosen position."""
-    position = read["position"]
-    profile, course = readings.plot_profile(joint, position), readings.plot_drift(joint, read)
-    field = readings.plot_drift_map(joint, position)
-    linker.link(profile.figure, x=POSITION)
-    linker.link(course.figure, x=HOURS)
-    linker.link(field.figure, x=CYCLE, y=POSITION)
-    _highlight(read, joint, selection, course)
-    profile_words = f"{caption('profile').rstrip('.')} ({say('drift_uncertainty', products.results.iso230)})."
-    return [
-        ui.heading("Profile and drift", level=3),
-        shown(profile, f"{profile_words} A click chooses the position."),
-        shown(course, f"{caption('drift')} Thick: the chosen position. A click chooses the cycle."),
-        shown(field, "Drift over cycle and position. A click chooses both."),
-        position_history(read, joint, selection, linker),
-    ]
-
-
-def _highlight(read: xr.Dataset, joint: xr.Dataset, selection: Selection, course: Chart) -> None:
-    """Draw the drift of the chosen position over the others."""
-    hours, lines = hours_since_start(read).mean("direction"), joint["drift_since_first"].mean("direction")
-
-    def data() -> dict[str, np.ndarray]:
-        return {"x": hours.sel(target=selection.target).values, "y": lines.sel(target=selection.target).values}
-
-    source = ColumnDataSource(data())
-    course.figure.line("x", "y", source=source, line_color=ACCENT, line_width=3)
-    selection.watch(lambda: source.update(data=data()), "target")
-
-
-def position_history(read: xr.Dataset, joint: xr.Dataset, selection: Selection, linker: Linker) -> pn.viewable.Viewable:
-    """Return the readings of the chosen position over time, which follow the choice."""
+def position_readings(read: xr.Dataset, joint: xr.Dataset, first: int) -> ui.Parts:
+    """Return the readings over time of the position that a menu chooses, with the estimated drift through them."""
     view = ui.column()
-    unlink: list[Callable[[], None]] = []
+    pairs = zip(read["target"].values.tolist(), read["position"].values.tolist(), strict=True)
+    names = {say("position_words", target, place): target for target, place in sorted(pairs, key=lambda one: one[1])}
+    menu = pn.widgets.Select(label="Position", options=names, value=first, width=280)
 
-    def show() -> None:
-        while unlink:
-            unlink.pop()()
-        if selection.target is not None:
-            chart = readings.plot_history(read, joint, selection.target)
-            unlink.append(linker.link(chart.figure, x=HOURS))
-            view[:] = [shown(chart, caption("history"))]
+    def show(target: int) -> None:
+        view[:] = [shown(readings.plot_history(read, joint, target), caption("history"))]
 
-    selection.watch(show, "target")
-    show()
-    return view
-
-
-def _standard_charts(read: xr.Dataset, products: Products, linker: Linker) -> ui.Parts:
-    """The test by ISO 230-2, and its values along the test."""
-    part = products.results.iso230
-    if part is None:
-        return []
-    values = ", ".join(f"{symbol} = {value}" for symbol, value in iso230_values(part).items())
-    parts: ui.Parts = [
-        ui.heading("ISO 230-2", level=3),
-        ui.paragraph(f"{part.window[:1].upper()}{part.window[1:]}: {values} (k = 2)."),
-    ]
-    if has(read, "quoted"):
-        chart = readings.plot_test(group(read, "quoted"), read["position"])
-        linker.link(chart.figure, x=POSITION)
-        parts.append(shown(chart, f"Means ± 2 s of both approaches, {part.window}."))
-    windows = group(read, "iso")
-    if readings.has_windows(windows):
-        chart = readings.plot_windows(windows)
-        linker.link(chart.figure, x=CYCLE)
-        parts.append(shown(chart, f"{caption('windows')} A click chooses the cycle."))
-    return parts
-
-
-def table_of(shown_table: Table, caption: str) -> pn.viewable.Viewable:
-    """Return a table of the report."""
-    return ui.table(shown_table.titles, [row.cells for row in shown_table.rows], caption=caption)
+    menu.param.watch(lambda event: show(event.new), "value")
+    show(first)
+    return [menu, view]
 
 
 # The thermal map with its cycles, and the temperature of chosen places over time.
@@ -142,8 +55,8 @@ _MOST_PLACES = 8
 class ThermalView:
     """The map of a run with a camera, and the places over time below it."""
 
-    def __init__(self, products: Products, selection: Selection, linker: Linker) -> None:
-        self._products, self._selection, self._linker = products, selection, linker
+    def __init__(self, products: Products, selection: Selection) -> None:
+        self._products, self._selection = products, selection
         self._fields = products.camera
         self._layers = {layer.words: layer for layer in products.layers}
         limits = {"start": int(products.cycles[0]), "end": int(products.cycles[-1]), "value": selection.cycle}
@@ -155,10 +68,8 @@ class ThermalView:
         self._cycle = pn.widgets.IntInput(label="Go to cycle", width=110, **limits)
         self._told = ui.markup("")
         self._marks = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []})
-        self._chosen = ColumnDataSource({"x": [], "y": []})
         self._map = self._draw()
         self._history = ui.column()
-        self._unlink: Callable[[], None] = lambda: None
         self._size = pn.widgets.FloatInput(label="square of / mm (0: a cell)", value=0.0, start=0.0, width=200)
         middles = {axis: round(float(self._fields[axis].values.mean()), 1) for axis in "xy"}
         self._x, self._y = (
@@ -167,7 +78,6 @@ class ThermalView:
         self._add = pn.widgets.Button(label="Add place", align="end")
         self._places = pn.widgets.MultiChoice(label="Places over time", options=[], sizing_mode="stretch_width")
         self._connect()
-        self._show_target()
         self._show_cycle()
         self._show_places()
 
@@ -175,8 +85,8 @@ class ThermalView:
     def view(self) -> pn.viewable.Viewable:
         """The map, its cycle, and the places over time."""
         legend = (
-            "A click on the map adds a place to the chart below. White line: the measured axis; ring: the chosen position; white frame: "
-            "the area that the drift follows, where there is one; one colour scale for all cycles."
+            "A click on the map adds a place to the chart below. White line: the measured axis; white frame: the "
+            "area that the drift follows, where there is one; one colour scale for all cycles."
         )
         chart = shown_drawing(self._map)
         controls = pn.FlexBox(self._x, self._y, self._size, self._add)
@@ -193,7 +103,6 @@ class ThermalView:
         self._add.on_click(lambda event: self._add_place(self._x.value, self._y.value))
         self._places.param.watch(lambda event: self._keep(event.new), "value")
         self._selection.watch(self._show_cycle, "cycle")
-        self._selection.watch(self._show_target, "target")
         self._selection.watch(self._show_places, "places")
         self._map.on_event(Tap, lambda event: self._add_place(event.x, event.y))
 
@@ -214,7 +123,6 @@ class ThermalView:
         if correlation is not None and correlation.verdict == "attributable" and correlation.source.area is not None:
             draw_followed(drawn, correlation.source.area)
         to_scale(drawn)
-        add_marks(drawn, "x", "y", "circle", 15, source=self._chosen)
         square = {"marker": "square", "size": 11, "fill_color": "colour", "line_color": "#ffffff", "line_width": 1.5}
         drawn.scatter("x", "y", source=self._marks, **square)
         return drawn
@@ -258,12 +166,6 @@ class ThermalView:
         self._show_cycle()
         self._show_places()
 
-    def _show_target(self) -> None:
-        """Ring the chosen position."""
-        fields = self._fields
-        seen = [one for one in fields["target"].values if one == self._selection.target] if "target_x" in fields else []
-        self._chosen.data = {axis: fields[f"target_{axis}"].sel(target=seen).values if seen else [] for axis in "xy"}
-
     def _add_place(self, x_mm: float | None, y_mm: float | None) -> None:
         """Add a place inside the plan, as far as there are colours left."""
         if x_mm is None or y_mm is None or len(self._selection.places) >= _MOST_PLACES:
@@ -299,8 +201,6 @@ class ThermalView:
             known = values[np.isfinite(values)]
             span = f"{number(float(known.min()))} to {number(float(known.max()))}" if known.size else "no value"
             told.append(f"{one.words} (mean of {cells} cells): {span}" if cells > 1 else f"{one.words}: {span}")
-        self._unlink()
-        self._unlink = self._linker.link(drawn, x=HOURS)
         seen = ui.note(f"{quantity[:1].upper()}{quantity[1:]} over time. {'; '.join(told)}.")
         self._history[:] = [shown_drawing(drawn), seen]
 

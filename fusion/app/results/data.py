@@ -10,15 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import param
 import xarray as xr
-from bokeh.events import Tap
-from bokeh.models import Span
-from bokeh.plotting import figure
 
 from fusion.app.parts import schedule_update
 from fusion.report.charts.plan import LAYERS, Layer, scale_of
 from fusion.results.results import Results, read_results
-from fusion.results.store import group, has, open_in_file, read_json_object, read_product, require_kind, require_own
-from interferometry.plots import ACCENT
+from fusion.results.store import group, has, open_in_file, read_product, require_kind, require_own
 
 #: Cycles from which the one colour scale of all cycles is taken; of a longer test evenly spaced ones.
 _SCALE_CYCLES = 60
@@ -40,11 +36,6 @@ class Products:
             self.fields.close()
 
     @cached_property
-    def provenance(self) -> dict[str, Any]:
-        """Content of provenance.json; empty where it is missing."""
-        return read_json_object(self.folder / "provenance.json")
-
-    @cached_property
     def fields(self) -> xr.Dataset | None:
         """fields.nc, opened and not read; None without a camera."""
         path = self.folder / "fields.nc"
@@ -63,7 +54,7 @@ class Products:
     def drift(self) -> xr.Dataset | None:
         """The joint estimate of profile and drift; None where the readings have no times, or there are none."""
         read = self.deviations
-        return group(read, "drift") if read is not None and has(read, "drift") else None
+        return group(read, "estimate") if read is not None and has(read, "estimate") else None
 
     @property
     def layers(self) -> list[Layer]:
@@ -77,15 +68,6 @@ class Products:
             if product is not None:
                 return np.asarray(product["cycle"].values, int)
         return np.array([], int)
-
-    @property
-    def targets(self) -> list[tuple[int, float]]:
-        """Number and position (mm) of every target, in the order of the axis."""
-        read = self.deviations
-        if read is None:
-            return []
-        pairs = zip(read["target"].values.tolist(), read["position"].values.tolist(), strict=True)
-        return sorted(((int(number), float(place)) for number, place in pairs), key=lambda one: one[1])
 
     @property
     def camera(self) -> xr.Dataset:
@@ -129,12 +111,7 @@ def _within(cells: np.ndarray, at: float, size: float) -> slice:
     return slice(int(inside[0]), int(inside[-1]) + 1)
 
 
-# What is chosen on the screen *Results*: a cycle, a position, and places on the plan; every part of the screen
-# watches it.
-
-#: What a coordinate of a chart is, so that a click on it chooses something.
-Axis = str
-POSITION, CYCLE, HOURS = "position", "cycle", "hours"
+# What is chosen on the screen *Results*: a cycle and places on the plan.
 
 
 class Place(NamedTuple):
@@ -152,10 +129,9 @@ class Place(NamedTuple):
 
 
 class Selection(param.Parameterized):
-    """The choice of one page; no target without a laser, places in the order in which they were added."""
+    """The choice of one page; places in the order in which they were added."""
 
     cycle: int = param.Integer()
-    target: int | None = param.Integer(default=None, allow_None=True)
     places: list[Place] = param.List(item_type=Place)
 
     def watch(self, update: Callable[[], None], name: str) -> param.parameterized.Watcher:
@@ -166,63 +142,3 @@ class Selection(param.Parameterized):
         """Add a place, once."""
         if place not in self.places:
             self.places = [*self.places, place]
-
-
-class Linker:
-    """Links charts to a selection: a line at what is chosen, and a click that chooses.
-
-    `targets` are numbers and positions (mm), `hours` the times of the cycles on the axes of the charts; None where there are none.
-    """
-
-    def __init__(
-        self, selection: Selection, targets: list[tuple[int, float]], cycles: np.ndarray, hours: np.ndarray | None
-    ) -> None:
-        self._selection = selection
-        self._targets = targets
-        #: Cycles, and where they are on an axis of charts.
-        self._cycles, self._shown = cycles, {CYCLE: cycles.astype(float), HOURS: hours}
-
-    def link(self, drawn: figure, *, x: Axis = "", y: Axis = "") -> Callable[[], None]:
-        """Mark the selection in a chart, and let a click on it choose; returns what ends that."""
-        sides = [(x, "height"), (y, "width")]
-        known = [(axis, side) for axis, side in sides if axis == POSITION or self._shown.get(axis) is not None]
-        watchers = [self._mark(drawn, axis, side) for axis, side in known]
-
-        def choose(event: Tap) -> None:
-            for axis, at in ((x, event.x), (y, event.y)):
-                if axis and at is not None:
-                    self._choose(axis, float(at))
-
-        drawn.on_event(Tap, choose)
-
-        def end() -> None:
-            for watcher in watchers:
-                self._selection.param.unwatch(watcher)
-
-        return end
-
-    def _mark(self, drawn: figure, axis: Axis, dimension: str) -> param.parameterized.Watcher:
-        """Draw a line at what is chosen, and move it with the choice."""
-        looks = {"line_color": ACCENT, "line_width": 2, "line_dash": "dashed", "name": f"chosen {axis}"}
-        span = Span(location=self._place(axis), dimension=dimension, **looks)
-        drawn.add_layout(span)
-        watched = "target" if axis == POSITION else "cycle"
-        return self._selection.watch(lambda: span.update(location=self._place(axis)), watched)
-
-    def _place(self, axis: Axis) -> float | None:
-        """Return where the selection lies on an axis; None where it has no place there."""
-        if axis == POSITION:
-            return dict(self._targets).get(self._selection.target or 0)
-        shown, at = self._shown[axis], np.flatnonzero(self._cycles == self._selection.cycle)
-        place = float(shown[at[0]]) if shown is not None and at.size else float("nan")
-        return place if np.isfinite(place) else None
-
-    def _choose(self, axis: Axis, at: float) -> None:
-        """Choose what lies nearest on an axis."""
-        if axis == POSITION:
-            if self._targets:
-                self._selection.target = min(self._targets, key=lambda one: abs(one[1] - at))[0]
-            return
-        shown = self._shown[axis]
-        if shown is not None and np.isfinite(shown).any():
-            self._selection.cycle = int(self._cycles[int(np.nanargmin(np.abs(shown - at)))])

@@ -11,14 +11,13 @@ from pathlib import Path
 import panel as pn
 
 from fusion.app import parts as ui
-from fusion.app.results.charts import ThermalView, laser_charts, reading_hours
-from fusion.app.results.data import Linker, Products, Selection
+from fusion.app.results.charts import ThermalView, position_readings
+from fusion.app.results.data import Products, Selection
 from fusion.common import FusionError, versions
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.page import ProductsError, print_pdf, report_of
 from fusion.report.sheet import describe_sheet, write_iso230, write_thermal_tests
-from fusion.report.wording import say
 from fusion.results.store import write_atomically
 
 
@@ -54,34 +53,22 @@ def results_screen(state: ui.State) -> pn.viewable.Viewable:
 
 def _parts(state: ui.State, products: Products) -> ui.Parts:
     """The title, what is chosen, and the parts of the screen."""
-    targets, cycles = products.targets, products.cycles
-    flagged = [anomaly.target for anomaly in products.results.anomalies or ()]
-    selection = Selection(
-        cycle=int(cycles[-1]) if cycles.size else 0,
-        target=flagged[0] if flagged else targets[len(targets) // 2][0] if targets else None,
-    )
-    hours = reading_hours(products)
-    if hours is None and products.fields is not None:
-        hours = products.field_hours
-    linker = Linker(selection, targets, cycles, hours)
-    report = products.folder / "report.html"
+    cycles, report = products.cycles, products.folder / "report.html"
+    selection = Selection(cycle=int(cycles[-1]) if cycles.size else 0)
     builders: dict[str, tuple[bool, Callable[[], ui.Parts]]] = {
         "Report": (report.is_file(), lambda: [ui.frame("Report", ui.report_link(state.root, products.folder))]),
-        "Map": (products.fields is not None, lambda: [ThermalView(products, selection, linker).view]),
-        "Laser": (products.deviations is not None, lambda: laser_charts(products, selection, linker)),
+        "Map": (products.fields is not None, lambda: [ThermalView(products, selection).view]),
+        "Readings": (products.drift is not None, lambda: _readings(products)),
     }
     shown = {name: build for name, (there, build) in builders.items() if there}
     if not shown:
         return [ui.paragraph(products.results.campaign), ui.note(f"{report} is missing: run the campaign again.")]
     parts = {name: partial(lambda build: ui.column(*_or_fault(build)), build) for name, build in shown.items()}
     chooser, part = ui.switched("Part", parts, next(iter(parts)))
-    menu = _chosen(selection, targets)
-    if menu is not None:
-        chooser.param.watch(lambda event: menu.param.update(visible=event.new != "Report"), "value")
     lead = [ui.paragraph(products.results.campaign)]
     if report.is_file():
         lead.append(ui.link("Open the report in a tab of its own", ui.report_link(state.root, products.folder)))
-    return [*lead, _printing(state, products), chooser, *([menu] if menu else []), part]
+    return [*lead, _printing(state, products), chooser, part]
 
 
 def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
@@ -121,17 +108,17 @@ def _put(out: Path, write: Callable[[Path], object]) -> None:
 def _write_sheet(results: Path, out: Path) -> None:
     """Write the test sheet of a run by ISO 230-2."""
     test = read_test(results, None)
-    sheet = describe_sheet(test.title, test.part, files=test.files, version=versions()["thermofuse"])
+    sheet = describe_sheet(test.title, test.part, files=test.files, version=versions()["thermofuse"], own=test.sheet)
     write_iso230(out, sheet, test.part, test.dataset, remarks=test.remarks)
 
 
 def _write_thermal_sheet(results: Path, out: Path) -> None:
     """Write the sheets of a test by ISO 230-3."""
-    title, tests, files = read_thermal_tests(results)
+    title, tests, files, own = read_thermal_tests(results)
     if not all(one.conditions for one in tests):
         told = "these results are of an earlier version and do not say whose test it was; run the campaign again"
         raise ProductsError(f"{results}: {told}, finished stages are kept")
-    write_thermal_tests(out, title, tests, files=files, version=versions()["thermofuse"])
+    write_thermal_tests(out, title, tests, files=files, version=versions()["thermofuse"], own=own)
 
 
 def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:
@@ -142,13 +129,9 @@ def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:
         return [ui.paragraph(str(error), kind="fault")]
 
 
-def _chosen(selection: Selection, targets: list[tuple[int, float]]) -> pn.widgets.Select | None:
-    """The menu of the position that is shown everywhere but in the report, which stands first; None without a laser."""
-    if not targets:
-        return None
-    names = {say("position_words", number, place): number for number, place in targets}
-    menu = pn.widgets.Select(
-        label="Position shown everywhere", options=names, value=selection.target, width=280, visible=False
-    )
-    menu.link(selection, bidirectional=True, value="target")
-    return menu
+def _readings(products: Products) -> ui.Parts:
+    """The readings of every position, first those of one that stands out."""
+    assert products.deviations is not None and products.drift is not None
+    flagged = [anomaly.target for anomaly in products.results.anomalies or ()]
+    first = flagged[0] if flagged else int(products.deviations["target"].values[0])
+    return position_readings(products.deviations, products.drift, first)

@@ -49,7 +49,7 @@ def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fuse
         charts |= {"rise_history": plan.plot_rise_history(fields), "contact_sheet": plan.plot_contact_sheet(fields)}
     if deviations is not None:
         charts |= _reading_charts(deviations)
-        charts |= _drift_charts(deviations) if has(deviations, "drift") else {}
+        charts |= _drift_charts(deviations) if has(deviations, "estimate") else {}
     if fused is not None:
         charts |= _clock_charts(fused, deviations)
     return Drawn(embed(charts))
@@ -68,8 +68,8 @@ def draw_attributed(fused: xr.DataTree, channel: str, least_p: float | None) -> 
 def draw_modelled(deviations: xr.Dataset, fused: xr.Dataset, standing_out: Set[int]) -> Drawn:
     """Draw what a model of the drift found, and the positions that stand out."""
     charts: dict[str, Chart] = {}
-    if has(deviations, "drift"):
-        joint = group(deviations, "drift")
+    if has(deviations, "estimate"):
+        joint = group(deviations, "estimate")
         shown = min(standing_out, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
         charts["history"] = readings.plot_history(deviations, joint, shown)
         charts["anomalies"] = readings.plot_position_scatter(joint, deviations["position"], standing_out)
@@ -106,7 +106,7 @@ def _clock_charts(fused: xr.Dataset, deviations: xr.Dataset | None) -> dict[str,
     if "local_rise" in fused:
         charts["axis_temperature"] = plan.plot_axis_temperature(fused)
         if deviations is not None:
-            charts["drift_temperature"] = plan.plot_drift_temperature(fused, group(deviations, "drift"))
+            charts["drift_temperature"] = plan.plot_drift_temperature(fused, group(deviations, "estimate"))
     return charts
 
 
@@ -138,7 +138,7 @@ def _sides(deviations: xr.Dataset) -> list[str]:
 
 def _drift_charts(deviations: xr.Dataset) -> dict[str, Chart]:
     """The charts of the drift of the readings."""
-    joint, position = group(deviations, "drift"), deviations["position"]
+    joint, position = group(deviations, "estimate"), deviations["position"]
     windows = group(deviations, "iso")
     both: dict[str, Chart] = {}
     if len(_sides(deviations)) == 2:

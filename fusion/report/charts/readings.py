@@ -8,18 +8,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from bokeh.layouts import column
-from bokeh.models import BoxAnnotation, LayoutDOM, LinearColorMapper, Whisker
+from bokeh.models import BoxAnnotation, LayoutDOM, Whisker
 from bokeh.models.sources import ColumnDataSource
 from bokeh.plotting import figure
 
 from fusion.report.charts.style import (
     CATEGORIES,
-    DIVERGING,
     MARKERS,
     Chart,
     Courses,
     add_band,
-    add_colour_bar,
     add_hover,
     add_label,
     add_ordered_lines,
@@ -30,7 +28,6 @@ from fusion.report.charts.style import (
     new_figure,
     of_direction,
     ordered_colours,
-    palette,
     shared_range,
     span_words,
 )
@@ -129,54 +126,6 @@ def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Se
         f"marked as standing out: {places}." if flagged else "none is marked as standing out."
     )
     return Chart(drawn, seen, courses.columns)
-
-
-def plot_drift_map(drift: xr.Dataset, position: xr.DataArray) -> Chart:
-    """Draw the drift as colours over cycle and position, mean of both approaches."""
-    return cycle_map(drift["drift_since_first"].mean("direction"), position, "drift / µm")
-
-
-def cycle_map(values: xr.DataArray, position: xr.DataArray, label: str) -> Chart:
-    """Draw values as colours over cycle and position; a value that is missing is left blank."""
-    order = np.argsort(position.values, kind="stable")
-    field = values.transpose("cycle", "target").values[:, order]
-    cycle, place = values["cycle"].values.astype(float), position.values[order].astype(float)
-    quantity, _, unit = label.rpartition(" / ")
-    low, high = shared_range(field, symmetrical=True)
-    mapper = LinearColorMapper(palette(DIVERGING), low=low, high=high, nan_color="#ffffff")
-    (left, right), (bottom, top) = edges(cycle), edges(place)
-    drawn = new_figure(
-        x="cycle", y="position / mm", height=300, x_range=(left[0], right[-1]), y_range=(bottom[0], top[-1])
-    )
-    drawn.grid.grid_line_color = None
-    across, along = field.shape
-    cells = draw(
-        drawn, "Quad", left="left", right="right", bottom="bottom", top="top", line_color=None,
-        fill_color={"field": "value", "transform": mapper},
-        source={
-            "left": np.repeat(left, along), "right": np.repeat(right, along), "bottom": np.tile(bottom, across),
-            "top": np.tile(top, across), "value": field.ravel(), "cycle": np.repeat(cycle, along), "place": np.tile(place, across),
-        },
-    )  # fmt: skip
-    tips = [("cycle", "@cycle{0}"), ("position", "@place{0.[000]} mm"), (quantity, f"@value{{0.00}} {unit}")]
-    add_hover(drawn, tips, [cells])
-    add_colour_bar(drawn, mapper, label)
-    largest = np.unravel_index(np.nanargmax(np.abs(field)), field.shape)
-    seen = (
-        f"{quantity.capitalize()} of {across} cycles at {along} positions: {span_words(field, unit)}; the largest size is in cycle "
-        f"{cycle[largest[0]]:.0f} at {place[largest[1]]:g} mm."
-    )
-    cycles = np.repeat(cycle, along).astype(int)
-    return Chart(drawn, seen, {"cycle": cycles, "position / mm": np.tile(place, across), label: field.ravel()})
-
-
-def edges(middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends of the cells about points along an axis: half-way to the neighbours."""
-    if middle.size < 2:
-        return middle - 0.5, middle + 0.5
-    between = (middle[1:] + middle[:-1]) / 2
-    first, last = 2 * middle[0] - between[0], 2 * middle[-1] - between[-1]
-    return np.concatenate([[first], between]), np.concatenate([between, [last]])
 
 
 # Chart of a test by ISO 230-2: means and ±2 s of both approaches over the targets, with A, E and B.

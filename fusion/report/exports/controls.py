@@ -141,7 +141,7 @@ def _on_lines(at_mm: Array, position_mm: Array, values: Array) -> Array:
 
 def read_profile(deviations: xr.Dataset) -> Profile:
     """Return the profile of a run."""
-    drift = group(deviations, "drift")
+    drift = group(deviations, "estimate")
     order = np.argsort(deviations["position"].values)
     position = deviations["position"].values[order].astype(float)
     chosen = drift.sel(direction=list(APPROACHES)).isel(target=order, other_target=order)
@@ -670,7 +670,7 @@ def fit_temperature_line(
         raise ExportError(
             f"{cycles} cycles; a temperature line needs at least {_BLOCKS * _CYCLES_PER_BLOCK}, to be judged on cycles left out of it"
         )
-    drift = deviations["deviation"] - group(deviations, "drift")["profile"]
+    drift = deviations["deviation"] - group(deviations, "estimate")["profile"]
     position = deviations["position"] - reference_mm
     _, distance, temperature = xr.broadcast(drift, position, material_degC.reindex_like(drift))
     dims = drift.dims

@@ -255,7 +255,7 @@ class _Run:
 def _read_run(folder: Path, results: Results) -> _Run:
     """Read the run that the table of a control is made from."""
     deviations = read_product(folder, "deviations")
-    if not has(deviations, "drift"):
+    if not has(deviations, "estimate"):
         raise ExportError(
             f"{folder}: the readings have no times, or are too few, so there is neither drift nor profile to write; --format csv and xlsx "
             "give the values by ISO 230-2"
@@ -312,7 +312,7 @@ def _predict_test(run: _Run, profile: Profile, table: ErrorTable, control: Contr
     iso = run.results.iso230
     cycles = len(iso.cycles) if iso is not None and iso.cycles else STANDARD_CYCLES
     forward, reverse = table.added_um(table.position_mm, one_table=control.one_table).tolist()
-    drift = group(run.deviations, "drift").assign(position=run.deviations["position"])
+    drift = group(run.deviations, "estimate").assign(position=run.deviations["position"])
     predicted = predict_test(
         profile, table, *scatter_and_drift(drift), cycles=max(cycles, 2), one_table=control.one_table
     )
@@ -446,7 +446,7 @@ def _csv_tables(
     folder: Path, results: Results, deviations: xr.Dataset, *, with_fields: bool
 ) -> dict[str, pd.DataFrame]:
     """Return the tables of an axis by the name of their file."""
-    timed = has(deviations, "drift")
+    timed = has(deviations, "estimate")
     frames = {
         "drift" if timed else "readings": tables.readings_table(deviations),
         **({"profile": tables.profile_table(deviations)} if timed else {}),

@@ -66,7 +66,7 @@ def axis_tables(results: Results, deviations: xr.Dataset) -> dict[str, pd.DataFr
         "Conditions": _conditions_table(results),
         "ISO 230-2 axis": iso230_axis_table(deviations),
         "ISO 230-2 positions": iso230_position_table(deviations, results),
-        **({"Profile": profile_table(deviations)} if has(deviations, "drift") else {}),
+        **({"Profile": profile_table(deviations)} if has(deviations, "estimate") else {}),
         "Readings": readings_table(deviations),
     }
 
@@ -92,8 +92,8 @@ def readings_table(deviations: xr.Dataset) -> pd.DataFrame:
     position, read = deviations["position"], deviations["deviation"]
     timed = {} if np.isnat(deviations["time"].values).all() else {"time_utc": deviations["time"]}
     columns = {"position_mm": position, **timed, "deviation_um": read}
-    if has(deviations, "drift"):
-        drift = group(deviations, "drift")
+    if has(deviations, "estimate"):
+        drift = group(deviations, "estimate")
         columns |= {"drift_um": drift["drift"], "drift_u_um": drift["drift_u"]}
     return _in_its_units(xr.Dataset(columns).to_dataframe().dropna(subset=["deviation_um"]).reset_index(), deviations)
 
@@ -107,7 +107,7 @@ def _in_its_units(table: pd.DataFrame, deviations: xr.Dataset) -> pd.DataFrame:
 
 def profile_table(deviations: xr.Dataset) -> pd.DataFrame:
     """Return the drift-free profile and the scatter per approach and target."""
-    drift = group(deviations, "drift")
+    drift = group(deviations, "estimate")
     columns = {"profile_um": "profile", "profile_u_um": "profile_u", "scatter_um": "scatter"}
     profile = {"position_mm": deviations["position"], **{key: drift[name] for key, name in columns.items()}}
     return xr.Dataset(profile).to_dataframe().reset_index()

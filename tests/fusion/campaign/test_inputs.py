@@ -61,7 +61,7 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     missing = {notice.code: notice for notice in outcome.notices}["readings_missing"]
     assert missing.message.startswith("2 readings of 288 missing, in ")
     # One reading of 24 at two cells: u grows by 1 - sqrt(23 / 24) = 2.1 %.
-    assert missing.effect_um == pytest.approx(0.021 * float(outcome.dataset["drift_profile_u"].max()), rel=0.2)
+    assert missing.effect_um == pytest.approx(0.021 * float(outcome.dataset["estimate_profile_u"].max()), rel=0.2)
 
 
 def test_a_link_whose_frame_is_gone_is_named(copied: Path) -> None:

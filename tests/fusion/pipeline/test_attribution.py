@@ -14,7 +14,7 @@ from fusion.pipeline.positioning import align_recordings
 from fusion.report.campaign import describe_correlation
 from fusion.results.progress import silent
 from fusion.results.results import SCHEMA_VERSION, Results, assemble
-from fusion.results.store import plain, read_dataset
+from fusion.results.store import plain, read_dataset, read_grouped
 from fusion.twin.machine import duty_levels
 from fusion.twin.recipe import Duty
 from tests.fusion.campaign_parts import change
@@ -41,7 +41,7 @@ def campaign(campaign_folder, tmp_path_factory):
 def outcome(campaign, results_folder):
     source = read_source(load_campaign(campaign / "campaign.toml"))
     fields = read_dataset(results_folder / "fields.nc")
-    fused, _ = align_recordings(source, fields, read_dataset(results_folder / "deviations.nc"))
+    fused, _ = align_recordings(source, fields, read_grouped(results_folder / "deviations.nc"))
     found = correlate_field(source, fields, fused, report=silent)
     return found.dataset, found.parts, fused
 

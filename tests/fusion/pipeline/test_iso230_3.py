@@ -134,7 +134,7 @@ operator = "A. Smith"
 approved_by = "B. Jones"
 """
     )
-    title, tests, files = read_thermal_tests(tmp_path / "campaign.toml")
+    title, tests, files, _ = read_thermal_tests(tmp_path / "campaign.toml")
     assert files == {name: file_sha256(tmp_path / name) for name in ("campaign.toml", "record.csv")}
     sheet = describe_thermal_sheet(title, tests[0], files=files, version="0")
     assert dict(sheet.stated.identity) | {"Machine": "Mill 7", "Date of the test": "not stated"} == dict(

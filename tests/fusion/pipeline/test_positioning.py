@@ -29,7 +29,7 @@ from fusion.pipeline.positioning import (
 from fusion.report.wording import drift_extremes, drift_size
 from fusion.results.axis import Evidence
 from fusion.results.results import Notice
-from fusion.results.store import read_dataset
+from fusion.results.store import read_product
 from fusion.twin import simulate
 from fusion.twin.recipe_file import read_recipe
 from fusion.twin.truth import deviations_of
@@ -41,7 +41,7 @@ from tests.fusion.campaign_parts import write_laser
 @pytest.fixture
 def aligned(campaign_folder, results_folder):
     """Inputs, fields and deviations of the small campaign."""
-    fields, deviations = (read_dataset(results_folder / f"{name}.nc") for name in ("fields", "deviations"))
+    fields, deviations = (read_product(results_folder, name) for name in ("fields", "deviations"))
     source = read_source(load_campaign(campaign_folder / "campaign.toml"))
     assert isinstance(source, Source)
     return source, fields, deviations
@@ -80,14 +80,14 @@ def test_parts_agree_with_the_product(campaign_folder):
     assert standard.first.cycles == (1, 2, 3, 4, 5) and standard.cycles[0] > 12
     for found, name in ((standard.first, "iso_A"), (standard, "quoted_A")):
         assert found.A_um.value == pytest.approx(float(np.atleast_1d(outcome.dataset[name])[0]))
-    profile = outcome.dataset["drift_profile"]
+    profile = outcome.dataset["estimate_profile"]
     assert by_direction(profile).negative == tuple(profile.sel(direction="negative").values)
     time = outcome.dataset["time"].values
     told = outcome.parts.time
     for text, one in ((told.first, time.min()), (told.last, time.max())):
         assert np.datetime64(text[:-1]) == one.astype("datetime64[s]")
     assert told.zone is None
-    course = outcome.dataset["drift_drift"].mean("direction")
+    course = outcome.dataset["estimate_drift"].mean("direction")
     drift = outcome.parts.drift
     np.testing.assert_allclose(drift.range_um, course.max("cycle") - course.min("cycle"))
     assert all(0.0 < u < one for u, one in zip(drift.range_u_um, drift.range_um, strict=True))
@@ -101,7 +101,7 @@ def test_a_drift_of_nothing_is_known_no_better_than_the_readings_are(tmp_path):
     still = table.assign(deviation_um=table["target"] + rng.normal(0.0, 0.25, len(table)))
     still.to_csv(path.with_name("laser.csv"), index=False)
     outcome = evaluate_interferometry(read_source(load_campaign(path)))
-    scatter = float(outcome.dataset["drift_sigma"])
+    scatter = float(outcome.dataset["estimate_sigma"])
     # 120 readings less their means know a standard deviation to 7 %.
     assert scatter == pytest.approx(0.25, rel=0.2)
     assert min(outcome.parts.drift.range_u_um) >= 2.0 * scatter / np.sqrt(24) * (1.0 - 1e-12)
@@ -151,7 +151,7 @@ def test_an_error_of_reading_is_left_out_of_the_comparison_with_the_field_and_na
     sound, _ = align_recordings(source, fields, deviations)
     spoilt = deviations.copy(deep=True)
     spoilt["deviation"][10, 1, 3] = 1e6
-    spoilt["drift_standardised"][10, 1, 3] = np.inf
+    spoilt["estimate_standardised"][10, 1, 3] = np.inf
     fused, notices = align_recordings(source, fields, spoilt)
     message = next(notice.message for notice in notices if notice.code == "gross_readings")
     assert message.startswith("1 reading more than ten standard deviations of their position off, by up to 1e+06 µm: ")

@@ -14,7 +14,7 @@ from fusion.report.charts.embedded import MapControls
 from fusion.report.page import render_page
 from fusion.report.wording import environment, region_words, table
 from fusion.results.results import AxisLoop, CorrelationPart, Results, assemble, read_results
-from fusion.results.store import group, read_dataset, read_tree
+from fusion.results.store import group, read_grouped, read_tree
 from tests.fusion.report.page_tables import tables_of
 from tests.fusion.results_sample import PARTS
 
@@ -23,7 +23,7 @@ def test_four_standard_deviations_stand_side_by_side(results_folder):
     page = (results_folder / "report.html").read_text(encoding="utf-8")
     section = page[page.index("Standard deviations side by side") :]
     rows = section[: section.index("</table>")].split("<tr>")[1:]
-    comparison = group(read_dataset(results_folder / "deviations.nc"), "comparison")
+    comparison = group(read_grouped(results_folder / "deviations.nc"), "comparison")
     assert [row.split("</td>")[0].split(">")[-1] for row in rows[-5:]] == ["2", "3", "4", "5", "6"]
     last = comparison.sel(link=6)
     for direction in ("positive", "negative"):

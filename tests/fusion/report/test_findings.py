@@ -148,7 +148,7 @@ def test_what_is_not_verified_is_said_with_what_would_confirm_it():
     results = assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])
     rows = dict(summary_rows(results))
     assert rows["inputs"] == "sound in 1 checks\nnot verified: It is off. Check it."
-    assert rows["next"].startswith("1. Check it.")
+    assert rows["next"].endswith("3. Check it."), "what is inspected on the machine comes first"
     assert results.inputs.state == "sound" and results.inputs.assumptions("field") == ("the emissivity is right",)
     # A scale that all share makes no cause right or wrong.
     assert results.inputs.assumptions("positions", "attribution", "causes") == ()

@@ -11,12 +11,14 @@ import docx
 import numpy as np
 import pytest
 import xarray as xr
+from PIL import Image
 from playwright.sync_api import sync_playwright
 
 from fusion.campaign.recompensation import ROTARY_BUDGET
 from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, files_of_run, read_test
 from fusion.report.campaign import describe_iso230
 from fusion.report.findings import sharpen
+from fusion.report.letterhead import Letterhead, TemplateError, translation
 from fusion.report.page import PageFileError
 from fusion.report.sheet import (
     describe_sheet,
@@ -227,7 +229,7 @@ def test_beside_a_sheet_the_terminal_shows_the_axis_alone(test_sheet):
 
 def test_the_scatter_without_drift_stands_beside_two_windows_alone(part):
     readings, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
-    dataset = joined(readings, drift=estimate_drift(readings))
+    dataset = joined(readings, estimate=estimate_drift(readings))
     told = describe_iso230(part, dataset)
     assert told["scatter_um"] == pytest.approx(float(estimate_drift(readings)["scatter"].median()))
     alone = part.model_copy(update={"first": part})
@@ -355,6 +357,66 @@ def test_the_document_of_word_says_what_the_page_says(stated, tmp_path):
     assert [text for text in shown if text not in cells] == []
     assert len(written.inline_shapes) == 1 and cells.count("Date, signature:") == 2
     assert all(sha in written.paragraphs[-1].text for sha in sheet.files.values())
+
+
+@pytest.mark.chain
+def test_a_sheet_is_that_of_the_laboratory_and_in_its_language(stated, tmp_path):
+    Image.new("RGB", (60, 20), "navy").save(tmp_path / "logo.png")
+    (tmp_path / "lab.html").write_text(
+        "<style>b{color:navy}</style><b>Above</b>{{ sheet }}<i>Below</i>", encoding="utf-8"
+    )
+    template = docx.Document()
+    template.sections[0].footer.paragraphs[0].text = "Our footer"
+    template.save(str(tmp_path / "lab.docx"))
+    own = Letterhead(
+        head="Messlabor; Stadt", logo=str(tmp_path / "logo.png"), word_template=str(tmp_path / "lab.docx"),
+        page_template=str(tmp_path / "lab.html"), language="de",
+    )  # fmt: skip
+    plain, sheet = (
+        describe_sheet(stated.title, stated.part, files=stated.files, version="0", own=one) for one in (None, own)
+    )
+    # Every sentence of the program is in the catalogue; what somebody stated stays as it is, and so do days.
+    pairs = zip(
+        (*plain.stated.identity, *plain.stated.conditions),
+        (*sheet.stated.identity, *sheet.stated.conditions),
+        strict=True,
+    )
+    assert [name for (name, _), (other, _) in pairs if name == other] == []
+    sentences = [*plain.notes, *(cell for row in plain.requirements.rows for cell in row.cells), plain.standard]
+    others = [*sheet.notes, *(cell for row in sheet.requirements.rows for cell in row.cells), sheet.standard]
+    assert [text for text, other in zip(sentences, others, strict=True) if text == other] == []
+    told = dict((*sheet.stated.identity, *sheet.stated.conditions))
+    assert told["Steuerung"] == "LinuxCNC 2.9" and "2026-03-09" in told["Datum der Prüfung"]
+    rows = [row.cells[0] for row in sheet.values.rows]
+    assert "Umkehrspanne B" in rows and all("." not in row.cells[1] for row in sheet.values.rows)
+    write_iso230(tmp_path / "sheet.html", sheet, stated.part, stated.dataset, remarks=())
+    page = (tmp_path / "sheet.html").read_text(encoding="utf-8")
+    assert page.index("<b>Above</b>") < page.index("Messlabor<br>Stadt") < page.index("<i>Below</i>")
+    assert 'lang="de"' in page and "Datum, Unterschrift" in page and "data:image/png;base64," in page
+    write_iso230(tmp_path / "sheet.docx", sheet, stated.part, stated.dataset, remarks=())
+    (section,) = docx.Document(str(tmp_path / "sheet.docx")).sections
+    assert section.footer.paragraphs[0].text == "Our footer"
+    assert [one.text for one in section.header.paragraphs][-2:] == ["Messlabor", "Stadt"]
+    (tmp_path / "lab.html").write_text("no place", encoding="utf-8")
+    with pytest.raises(TemplateError, match=r"write \{\{ sheet \}\} where the sheet is to stand"):
+        render_iso230(sheet, stated.part, stated.dataset, remarks=())
+
+
+@pytest.mark.parametrize(
+    ("english", "german"),
+    [
+        ("18.1 ± 6.7", "18,1 ± 6,7"),
+        ("Not decided: A ≤ 7.5 µm. Pass: R ≤ 6 µm. 10 of 12 windows decide otherwise.",
+         "Nicht entschieden: A ≤ 7,5 µm. Bestanden: R ≤ 6 µm. 10 von 12 Fenstern entscheiden anders."),
+        ("More than 99 % of the drift (1.4 µm rms) follows the expansion of the axis and a sudden step together.",
+         "Mehr als 99 % der Drift (Effektivwert 1,4 µm) folgen zusammen der Ausdehnung der Achse und einem plötzlichen Sprung."),
+        ("A sentence that nobody translated, of 1.5 µm.", "A sentence that nobody translated, of 1.5 µm."),
+        ("LinuxCNC 2.9", "LinuxCNC 2.9"),
+    ],
+)  # fmt: skip
+def test_sentences_are_translated_with_what_stands_in_their_gaps(english, german):
+    assert translation("de")(english) == german
+    assert translation("en")(english) == english
 
 
 @pytest.mark.chain

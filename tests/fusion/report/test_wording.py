@@ -616,8 +616,8 @@ def test_the_model_comes_first_and_what_asks_for_nothing_is_left_out():
     )
     first, second, third, last = next_steps(found)
     assert first == effect_words("dead_path").remedy
-    assert "(a wave of 37 min)" in second
-    assert third == "Inspect the guide at position 3 (40 mm)." and last == "Start the camera earlier."
+    assert second == "Inspect the guide at position 3 (40 mm)."
+    assert "(a wave of 37 min)" in third and last == "Start the camera earlier."
     (nothing,) = next_steps(results(loop("complete")))
     assert nothing.startswith("Nothing has to be done")
 

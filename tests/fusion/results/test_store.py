@@ -334,10 +334,10 @@ DRIFT = xr.Dataset({"profile": ("target", [1.0, 2.0])}, {"target": [1, 2]})
 
 
 def test_a_part_comes_back_under_its_own_names() -> None:
-    product = joined(READINGS, drift=DRIFT)
-    assert set(product.data_vars) == {"deviation", "drift_profile"}
-    xr.testing.assert_equal(group(product, "drift"), DRIFT)
-    assert has(product, "drift") and not has(product, "iso")
+    product = joined(READINGS, estimate=DRIFT)
+    assert set(product.data_vars) == {"deviation", "estimate_profile"}
+    xr.testing.assert_equal(group(product, "estimate"), DRIFT)
+    assert has(product, "estimate") and not has(product, "iso")
 
 
 def test_every_group_opens_by_itself_with_its_coordinates(tmp_path: Path) -> None:

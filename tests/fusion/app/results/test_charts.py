@@ -6,58 +6,32 @@ import pytest
 from bokeh.events import Tap
 from bokeh.models import LinearColorMapper, Text
 
-from fusion.app.results.charts import ThermalView, laser_charts, reading_hours, table_of
-from fusion.app.results.data import Linker, Place, Products, Selection
-from fusion.report.wording import caption, table
+from fusion.app.parts import table
+from fusion.app.results.charts import ThermalView, position_readings
+from fusion.app.results.data import Place, Products, Selection
 from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart
 from fusion.results.results import CorrelationPart
 from tests.fusion.app.texts import texts
 
 
-def linker_of(products, selection):
-    return Linker(selection, products.targets, products.cycles, reading_hours(products))
-
-
-def test_profile_drift_and_standard_are_there(products):
-    selection = Selection(cycle=3, target=2)
-    told = texts(laser_charts(products, selection, linker_of(products, selection)))
-    for words in (*map(caption, ("profile", "drift", "history", "windows")), "ISO 230-2", "A = "):
-        assert words.rstrip(".") in told
-
-
-def test_the_chosen_position_is_drawn_over_the_others(products):
-    selection = Selection(cycle=3, target=2)
-    parts = laser_charts(products, selection, linker_of(products, selection))
-    course = parts[2].select(pn.pane.Bokeh)[0].object
-    chosen = course.renderers[-1].data_source
-    before = np.array(chosen.data["y"])
-    selection.target = 5
-    np.testing.assert_allclose(
-        chosen.data["y"], products.drift["drift_since_first"].mean("direction").sel(target=5).values
-    )
-    assert not np.allclose(before, chosen.data["y"])
-
-
-def test_the_readings_follow_the_choice(products):
-    selection = Selection(cycle=3, target=2)
-    parts = laser_charts(products, selection, linker_of(products, selection))
+def test_the_readings_follow_the_position_that_is_chosen(products):
+    parts = position_readings(products.deviations, products.drift, 2)
     assert "Readings at 50 mm" in texts(parts)
-    selection.target = 4
+    parts[0].value = 4
     assert "Readings at 150 mm" in texts(parts) and "Readings at 50 mm" not in texts(parts)
 
 
 def test_text_of_a_table_is_never_markup():
-    shown = table_of(table(["a", "b"], [["<b>x</b>", "1"]]), "<i>caption</i>")
+    shown = table(["a", "b"], [["<b>x</b>", "1"]], caption="<i>caption</i>")
     assert "<b>x" not in shown.object and "&lt;b&gt;x" in shown.object and "<i>" not in shown.object
 
 
 @pytest.fixture
 def seen(results_folder):
     products = Products(results_folder)
-    selection = Selection(cycle=24, target=2)
-    linker = Linker(selection, products.targets, products.cycles, products.field_hours)
-    return products, selection, ThermalView(products, selection, linker)
+    selection = Selection(cycle=24)
+    return products, selection, ThermalView(products, selection)
 
 
 def image(view):
@@ -86,8 +60,8 @@ def test_the_area_that_the_drift_follows_is_drawn_on_the_map(results_folder):
         source = SourcePart.model_construct(area=area)
         correlation = CorrelationPart.model_construct(verdict=verdict, source=source)
         products.results = products.results.model_copy(update={"correlation": correlation})
-        selection = Selection(cycle=24, target=2)
-        view = ThermalView(products, selection, Linker(selection, products.targets, products.cycles, None))
+        selection = Selection(cycle=24)
+        view = ThermalView(products, selection)
         drawn = view.view.select(pn.pane.Bokeh)[0].object
         texts = [one for one in drawn.renderers if isinstance(one.glyph, Text)]
         return {word for one in texts for word in np.ravel(one.data_source.data.get(one.glyph.text, one.glyph.text))}

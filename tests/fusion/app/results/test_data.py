@@ -1,15 +1,12 @@
-"""Products of a run as the screens read them, and a selection that every chart follows."""
+"""Products of a run as the screens read them, and the places that are chosen."""
 
 import shutil
 
 import h5py
 import numpy as np
 import pytest
-from bokeh.events import Tap
-from bokeh.models import Span
-from bokeh.plotting import figure
 
-from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Products, Selection
+from fusion.app.results.data import Place, Products, Selection
 from fusion.results.results import ResultsError
 from fusion.results.store import DamagedProductError, read_dataset, write_dataset
 
@@ -36,9 +33,8 @@ def test_one_scale_holds_all_cycles_and_the_fields_stay_on_disk(products, result
     assert products.fields["temperature_rise"].variable._in_memory is False
 
 
-def test_targets_and_cycles_are_those_of_the_test(products):
+def test_cycles_are_those_of_the_test(products):
     assert products.cycles.tolist() == list(range(1, 25))
-    assert [place for _, place in products.targets] == sorted(place for _, place in products.targets)
     assert products.field_hours.shape == (24,) and products.field_hours[0] > 0
 
 
@@ -46,12 +42,12 @@ def test_a_laser_alone_a_camera_alone_and_no_results(results_folder, tmp_path):
     laser = shutil.copytree(results_folder, tmp_path / "laser")
     (laser / "fields.nc").unlink()
     alone = Products(laser)
-    assert alone.fields is None and alone.layers == [] and len(alone.targets) == 6
+    assert alone.fields is None and alone.layers == [] and alone.cycles.size == 24
     camera = shutil.copytree(results_folder, tmp_path / "camera")
     for name in ("deviations.nc", "fusion.nc"):
         (camera / name).unlink()
     seen = Products(camera)
-    assert seen.deviations is None and seen.drift is None and seen.targets == []
+    assert seen.deviations is None and seen.drift is None
     assert seen.cycles.size == 24 and seen.field_hours[0] == 0.0
     with pytest.raises(ResultsError, match=r"there is no results\.json in it"):
         Products(tmp_path)
@@ -87,49 +83,6 @@ def test_products_that_the_run_did_not_write_are_told(results_folder, tmp_path):
     (tmp_path / "results.json").write_text(text.replace("Small campaign", "Another campaign"), encoding="utf-8")
     with pytest.raises(DamagedProductError, match=r"results\.json: is not the file that this run wrote"):
         Products(tmp_path)
-
-
-TARGETS = [(1, 0.0), (3, 50.0), (2, 100.0)]
-
-
-@pytest.fixture
-def linked():
-    selection = Selection(cycle=4, target=1)
-    linker = Linker(selection, TARGETS, np.array([1, 2, 4]), np.array([0.1, 0.2, 0.5]))
-    field, course = figure(), figure()
-    linker.link(field, x=CYCLE, y=POSITION)
-    linker.link(course, x=HOURS)
-    return selection, field, course
-
-
-def tap(drawn, x, y):
-    drawn._trigger_event(Tap(drawn, x=x, y=y))
-
-
-def places(drawn):
-    return [span.location for span in drawn.center if isinstance(span, Span)]
-
-
-def test_a_click_chooses_the_nearest_and_every_chart_follows(linked):
-    selection, field, course = linked
-    assert places(field) == [4.0, 0.0] and places(course) == [0.5]
-    tap(field, 2.4, 61.0)
-    assert (selection.cycle, selection.target) == (2, 3)
-    assert places(field) == [2.0, 50.0] and places(course) == [0.2]
-    tap(course, 0.0, 99.0)
-    assert (selection.cycle, selection.target) == (1, 3)
-
-
-def test_a_chart_follows_until_it_is_drawn_anew_and_without_times_a_click_chooses_nothing():
-    selection, drawn = Selection(cycle=1), figure()
-    unlink = Linker(selection, [], np.array([1, 2]), None).link(drawn, x=CYCLE, y=POSITION)
-    unlink()
-    selection.cycle = 2
-    assert places(drawn) == [1.0, None]
-    selection, drawn = Selection(cycle=1), figure()
-    Linker(selection, [], np.array([1, 2]), None).link(drawn, x=HOURS, y=POSITION)
-    tap(drawn, 3.0, 3.0)
-    assert (selection.cycle, selection.target) == (1, None)
 
 
 def test_a_place_is_added_once_and_named():

@@ -67,7 +67,7 @@ def name_folder(page, folder):
     opened(page, "Open")
 
 
-def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page):
+def test_a_cycle_and_a_position_are_chosen_by_keyboard(page):
     opened(page, "Results")
     opened(page, "Map")
     page.get_by_text("Cycle 24 (").wait_for()
@@ -76,10 +76,10 @@ def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page):
     for cycle in (23, 22, 21, 20):
         page.keyboard.press("ArrowLeft")
         page.get_by_text(f"Cycle {cycle} (").wait_for()
-    menu = page.get_by_label("Position shown everywhere")
+    page.get_by_role("button", name="Readings", exact=True).press("Enter")
+    menu = page.get_by_label("Position", exact=True)
     menu.focus()
     menu.select_option("Position 5 (200 mm)")
-    page.get_by_role("button", name="Laser", exact=True).press("Enter")
     page.get_by_text("Readings at 200 mm").wait_for()
     opened(page, "Map")
     page.get_by_text("Cycle 20 (").wait_for()
@@ -107,8 +107,8 @@ def test_the_report_stands_first_and_says_what_was_found(page):
 def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page, app):
     name_folder(page, app[1] / "laser_alone")
     page.get_by_text("<img src=x onerror=alert(1)>").wait_for()
-    opened(page, "Laser")
-    page.get_by_text("Profile and drift", exact=True).wait_for()
+    opened(page, "Readings")
+    page.get_by_text("Readings at").first.wait_for()
     assert page.get_by_text("Map", exact=True).count() == 0
 
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.results.store import read_dataset, read_tree
+from fusion.results.store import read_dataset, read_grouped, read_tree
 
 
 @pytest.fixture(scope="session")
 def deviations(results_folder):
-    return read_dataset(results_folder / "deviations.nc")
+    return read_grouped(results_folder / "deviations.nc")
 
 
 @pytest.fixture(scope="session")

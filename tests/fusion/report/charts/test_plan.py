@@ -51,7 +51,7 @@ def test_rise_along_the_axis_and_drift_against_it(fused, deviations):
     rise = root["local_rise"].mean("direction")
     last = along.columns["cycle"] == along.columns["cycle"].max()
     np.testing.assert_allclose(along.columns["rise / K"][last], rise.isel(cycle=-1))
-    against = plan.plot_drift_temperature(root, group(deviations, "drift"))
+    against = plan.plot_drift_temperature(root, group(deviations, "estimate"))
     lines = against.figure.renderers[1].data_source.data
     np.testing.assert_allclose(lines["xs"][3], rise.isel(target=3))
     assert "no proof" in against.seen

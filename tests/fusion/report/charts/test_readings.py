@@ -11,7 +11,6 @@ from fusion.report.charts import readings as neighbours
 from fusion.report.charts.readings import (
     plot_cycles,
     plot_drift,
-    plot_drift_map,
     plot_history,
     plot_position_scatter,
     plot_profile,
@@ -81,7 +80,7 @@ def test_profile_with_its_band(still_readings):
 
 
 def test_reversal_and_scatter_of_a_campaign(deviations):
-    drift, position = group(deviations, "drift"), deviations["position"]
+    drift, position = group(deviations, "estimate"), deviations["position"]
     chart = plot_reversal(drift, position)
     np.testing.assert_array_equal(chart.columns["reversal / µm"], drift["reversal"])
     assert chart.figure.yaxis.axis_label == "positive − negative / µm"
@@ -90,18 +89,6 @@ def test_reversal_and_scatter_of_a_campaign(deviations):
     assert shades == [30.0, 180.0]
     assert chart.seen.endswith("marked as standing out: 50 mm and 200 mm.")
     assert plot_position_scatter(drift, position, set()).seen.endswith("none is marked as standing out.")
-
-
-def test_a_map_over_cycle_and_position(still_readings):
-    drift, at = still_readings
-    chart = plot_drift_map(drift, at["position"])
-    cells = chart.figure.renderers[0].data_source.data
-    assert cells["value"].tolist() == [0.0, 0.0, 0.5, 1.0, 1.0, 2.0]
-    assert (cells["bottom"][0], cells["top"][0]) == (-50.0, 50.0)
-    assert (cells["left"][0], cells["right"][0]) == (0.5, 1.5)
-    assert "0.00 to 2.00 µm" in chart.seen and "in cycle 3 at 100 mm" in chart.seen
-    mapper = chart.figure.renderers[0].glyph.fill_color.transform
-    assert mapper.low == -mapper.high
 
 
 def test_both_approaches_have_one_scale_and_every_cycle_a_line(deviations):
@@ -117,7 +104,7 @@ def test_both_approaches_have_one_scale_and_every_cycle_a_line(deviations):
 
 
 def test_the_history_holds_readings_and_the_line_through_them(deviations):
-    drift = group(deviations, "drift")
+    drift = group(deviations, "estimate")
     chart = plot_history(deviations, drift, 2)
     read = deviations["deviation"].sel(target=2, direction="positive")
     np.testing.assert_array_equal(chart.columns["deviation, positive approach / µm"], read)

@@ -48,7 +48,7 @@ def write_run(folder: Path, deviations: xr.Dataset, *, axis: str = "X", **change
     """Write deviations.nc, fusion.nc, results.json and provenance.json of a run whose verdict is sound unless `changes` say otherwise."""
     parts = {**PARTS, "inputs": {"state": "sound", "accepted": [], "checks": []}, **changes}
     quoted = evaluate_iso230(deviations, cycles=range(6, 11))  # the window that PARTS quotes
-    content = joined(deviations, drift=estimate_drift(deviations), iso=evaluate_windows(deviations), quoted=quoted)
+    content = joined(deviations, estimate=estimate_drift(deviations), iso=evaluate_windows(deviations), quoted=quoted)
     write_dataset(folder / "deviations.nc", content)
     dims = ("cycle", "direction", "target")
     degC = np.broadcast_to(material_degC()[:, None, None], deviations["deviation"].shape)

@@ -25,7 +25,7 @@ from fusion.report.exports.controls import (
     twincat,
 )
 from fusion.report.exports.export import predict, predict_test, remainder_um
-from fusion.results.store import group, read_dataset
+from fusion.results.store import group, read_dataset, read_grouped
 from tests.fusion.report.exports.small_run import (
     SHIFT_UM_PER_K,
     STRETCH_PPM_PER_K,
@@ -201,7 +201,7 @@ def profile_of(position_mm: np.ndarray, values_um: np.ndarray, u_um: float = 0.0
 
 
 def test_the_profile_of_a_run_is_that_of_the_axis(small_run):
-    profile = read_profile(read_dataset(small_run / "deviations.nc"))
+    profile = read_profile(read_grouped(small_run / "deviations.nc"))
     np.testing.assert_array_equal(profile.position_mm, UNEVEN_MM)
     expected = true_profile_um(UNEVEN_MM) - true_profile_um(UNEVEN_MM)[0]
     table = tabulate(profile)
@@ -212,7 +212,7 @@ def test_the_profile_of_a_run_is_that_of_the_axis(small_run):
 
 
 def test_targets_in_any_order_are_sorted(small_run):
-    deviations = read_dataset(small_run / "deviations.nc")
+    deviations = read_grouped(small_run / "deviations.nc")
     turned = deviations.isel(target=slice(None, None, -1), other_target=slice(None, None, -1))
     expected, found = read_profile(deviations), read_profile(turned)
     np.testing.assert_array_equal(found.position_mm, expected.position_mm)
@@ -260,8 +260,8 @@ def test_a_straight_profile_has_no_uncertainty_between_targets():
 
 
 def test_what_does_not_suit_is_refused(small_run):
-    deviations = read_dataset(small_run / "deviations.nc")
-    one_sided = deviations.assign(drift_profile=deviations["drift_profile"].where(deviations["target"] != 3))
+    deviations = read_grouped(small_run / "deviations.nc")
+    one_sided = deviations.assign(estimate_profile=deviations["estimate_profile"].where(deviations["target"] != 3))
     with pytest.raises(ExportError, match=r"no profile at 48 mm in one approach; a compensation table needs both"):
         read_profile(one_sided)
     single = deviations.isel(target=[0], other_target=[0])
@@ -278,7 +278,7 @@ def test_what_does_not_suit_is_refused(small_run):
 
 
 def test_a_table_at_the_targets_leaves_only_the_errors_of_measurement(small_run):
-    profile = read_profile(read_dataset(small_run / "deviations.nc"))
+    profile = read_profile(read_grouped(small_run / "deviations.nc"))
     prediction = predict(profile, tabulate(profile), one_table=False)
     assert prediction["own_um"] < 1e-9 and prediction["resampling_um"] < 1e-9
     assert prediction["before_um"] == pytest.approx(np.ptp(profile.deviation_um))
@@ -309,7 +309,7 @@ def test_a_test_with_a_table_drifts_as_the_one_that_it_was_made_from():
 
 
 def test_one_table_leaves_the_part_of_the_reversal_that_is_not_constant(small_run):
-    profile = read_profile(read_dataset(small_run / "deviations.nc"))
+    profile = read_profile(read_grouped(small_run / "deviations.nc"))
     reversal = profile.deviation_um[0] - profile.deviation_um[1]
     left = remainder_um(profile, tabulate(profile), one_table=True)
     constant = left - (reversal - reversal.mean()) / 2 * np.array([[1.0], [-1.0]])
@@ -332,8 +332,8 @@ def test_the_reversal_that_one_table_leaves_is_counted_without_the_noise_of_its_
 
 
 def test_scatter_of_few_cycles_is_drawn_together_where_it_differs_by_chance(small_run):
-    deviations = read_dataset(small_run / "deviations.nc")
-    drift = group(deviations, "drift").assign(position=deviations["position"])
+    deviations = read_grouped(small_run / "deviations.nc")
+    drift = group(deviations, "estimate").assign(position=deviations["position"])
     own = drift["scatter"].values
     scatter, *_ = scatter_and_drift(drift)
     assert np.ptp(scatter) < 0.5 * np.ptp(own) and np.sqrt(np.mean(scatter**2)) == pytest.approx(0.05, rel=0.15)
@@ -342,14 +342,14 @@ def test_scatter_of_few_cycles_is_drawn_together_where_it_differs_by_chance(smal
 
 
 def test_a_coarse_table_leaves_more_and_says_so(small_run):
-    profile = read_profile(read_dataset(small_run / "deviations.nc"))
+    profile = read_profile(read_grouped(small_run / "deviations.nc"))
     coarse = predict(profile, tabulate(profile, spacing_mm=60.0), one_table=False)
     assert coarse["resampling_um"] > 0.5 and coarse["own_um"] > 0.5
 
 
 def line_of(folder):
     material = read_dataset(folder / "fusion.nc")["material_temperature"]
-    return fit_temperature_line(read_dataset(folder / "deviations.nc"), material, reference_mm=0.0)
+    return fit_temperature_line(read_grouped(folder / "deviations.nc"), material, reference_mm=0.0)
 
 
 def test_coefficients_are_those_of_the_axis(small_run):
@@ -378,7 +378,7 @@ def test_setting_data_bring_the_drift_to_zero(small_run):
 
 def test_a_temperature_that_predicts_nothing_is_an_objection(small_run):
     """Temperatures without a relation to the drift: refused in nearly every case, for the one reason or the other."""
-    deviations = read_dataset(small_run / "deviations.nc")
+    deviations = read_grouped(small_run / "deviations.nc")
     rng = np.random.default_rng(3)
     reasons = []
     for _ in range(100):
@@ -391,7 +391,7 @@ def test_a_temperature_that_predicts_nothing_is_an_objection(small_run):
 
 
 def test_too_few_cycles_and_a_constant_temperature_are_refused(small_run):
-    deviations = read_dataset(small_run / "deviations.nc")
+    deviations = read_grouped(small_run / "deviations.nc")
     material = read_dataset(small_run / "fusion.nc")["material_temperature"]
     with pytest.raises(ExportError, match="6 cycles; a temperature line needs at least 10"):
         fit_temperature_line(deviations.isel(cycle=slice(6)), material, reference_mm=0.0)

@@ -20,7 +20,7 @@ from fusion.report.exports.export import FORMATS, export_results, objections, re
 from fusion.report.exports.tables import profile_table, readings_table, write_workbook
 from fusion.results.parts import TablePredictionError, read_table_prediction
 from fusion.results.results import Results, ResultsError, assemble, read_results
-from fusion.results.store import read_dataset, write_dataset, write_json
+from fusion.results.store import read_dataset, read_grouped, write_dataset, write_json
 from tests.fusion.report.exports.small_run import measured, write_fields, write_run
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
 from thermography.common import write_csv
@@ -47,10 +47,10 @@ def test_csv_writes_tables_and_leaves_the_large_one_out(small_run, tmp_path):
 
 def test_csv_holds_every_number_as_it_was_computed(small_run, tmp_path):
     written = export_results(small_run, "csv", tmp_path).files
-    deviations = read_dataset(small_run / "deviations.nc")
+    deviations = read_grouped(small_run / "deviations.nc")
     # A position beyond a metre, a displacement that counts from far away, and what is far below one.
     moved = deviations.assign_coords(position=deviations["position"] + 1234.5678)
-    moved = moved.assign(deviation=moved["deviation"] + 1_234_567.0, drift_drift=moved["drift_drift"] * 1e-9)
+    moved = moved.assign(deviation=moved["deviation"] + 1_234_567.0, estimate_drift=moved["estimate_drift"] * 1e-9)
     for folder, dataset in ((written[0].parent, deviations), (tmp_path / "far", moved)):
         folder.mkdir(exist_ok=True)
         for name, made in (("drift", readings_table(dataset)), ("profile", profile_table(dataset))):
@@ -397,7 +397,7 @@ def test_a_position_that_moves_unlike_the_others_is_an_objection(kind, cause):
 
 
 def lines_of(folder, **changes) -> list[str]:
-    state = read_thermal_state(folder, read_dataset(folder / "deviations.nc"))
+    state = read_thermal_state(folder, read_grouped(folder / "deviations.nc"))
     origin = read_origin(folder, read_results(folder), state)
     stated = {"words": "A control", "axis": "X", "sign": "plus", "objections": [], "remarks": []}
     return header_lines(origin, **{**stated, **changes}, exported=datetime(2026, 11, 22, 9, 30, tzinfo=UTC))
@@ -436,7 +436,7 @@ def test_what_is_not_stated_is_said(small_run, tmp_path):
 
 
 def test_what_is_not_recorded_is_said(small_run, tmp_path):
-    deviations = read_dataset(small_run / "deviations.nc")
+    deviations = read_grouped(small_run / "deviations.nc")
     untimed = deviations.assign(
         time=deviations["time"].copy(data=np.full(deviations["time"].shape, np.datetime64("NaT", "ns")))
     )
@@ -445,7 +445,7 @@ def test_what_is_not_recorded_is_said(small_run, tmp_path):
 
 
 def test_readings_and_profile_are_complete(small_run):
-    deviations = read_dataset(small_run / "deviations.nc")
+    deviations = read_grouped(small_run / "deviations.nc")
     readings = tables.readings_table(deviations)
     assert len(readings) == 12 * 2 * 8 and readings["deviation_um"].notna().all()
     gap = deviations.assign(deviation=deviations["deviation"].where(deviations["cycle"] != 4))
@@ -455,7 +455,7 @@ def test_readings_and_profile_are_complete(small_run):
 
 
 def test_iso230_values_are_those_of_the_standard(small_run):
-    deviations = read_dataset(small_run / "deviations.nc")
+    deviations = read_grouped(small_run / "deviations.nc")
     x = deviations["deviation"].values[:5]
     mean, s = x.mean(axis=0), x.std(axis=0, ddof=1)
     axis = tables.iso230_axis_table(deviations).set_index(["window", "quantity", "direction"])
@@ -467,7 +467,7 @@ def test_iso230_values_are_those_of_the_standard(small_run):
 
 
 def test_positions_are_of_the_window_that_the_results_state(small_run):
-    deviations, results = read_dataset(small_run / "deviations.nc"), read_results(small_run)
+    deviations, results = read_grouped(small_run / "deviations.nc"), read_results(small_run)
     assert results.iso230.window == "cycles 6 to 10"
     positions = tables.iso230_position_table(deviations, results)
     assert (positions["count_positive"] == 5).all()
@@ -496,7 +496,7 @@ def test_a_workbook_without_room_for_its_temporary_files_is_refused_as_a_full_di
 
 
 def test_the_workbook_reads_back(small_run, tmp_path):
-    deviations = read_dataset(small_run / "deviations.nc")
+    deviations = read_grouped(small_run / "deviations.nc")
     results = read_results(small_run)
     write_workbook(tmp_path / "results.xlsx", tables.axis_tables(results, deviations))
     book = openpyxl.load_workbook(tmp_path / "results.xlsx")
