@@ -840,9 +840,9 @@ def read_times(
         time, words = _formatted_times(path, texts, record)
     elif parts is not None:
         time, words = parts.to_numpy("M8[ns]"), tables.NO_ZONE
-    elif np.isfinite(seconds).mean() > 0.5:
+    elif 2 * np.isfinite(seconds).sum() > seconds.size:
         time, words = _counted_times(path, seconds, rows, record, headings[0])
-    elif np.isfinite(elapsed := tables.elapsed_s(texts)).mean() > 0.5:
+    elif 2 * np.isfinite(elapsed := tables.elapsed_s(texts)).sum() > elapsed.size:
         time, words = _after_start(elapsed, record, path)
     else:
         lines = [(int(line), text) for line, text in zip(frame.index, texts, strict=True)]
