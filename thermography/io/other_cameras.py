@@ -955,7 +955,10 @@ def _fields(line: str, delimiter: str) -> list[str]:
         fields = line.replace('"', "").split()
     else:
         text = line.rstrip().removesuffix(delimiter)
-        fields = next(csv.reader([text], delimiter=delimiter), []) if '"' in text else text.split(delimiter)
+        try:
+            fields = next(csv.reader([text], delimiter=delimiter), []) if '"' in text else text.split(delimiter)
+        except csv.Error:  # a return within the line, or a field of 128 kB: no row of numbers
+            return []
     return [field.replace(",", ".") for field in fields] if "," in line else fields
 
 
