@@ -42,6 +42,8 @@ PARTLY_SEEN_BELOW = 0.99
 _LARGE_PX = 60_000
 #: ... this number of rows on either side of the middle determines the noise to a per cent.
 _NOISE_ROWS = 32
+#: Fewest pixels of a column, and fewest columns, that show whether these share a noise.
+_LEAST_ROWS, _LEAST_COLUMNS = 8, 40
 
 
 @dataclass
@@ -90,6 +92,10 @@ class CyclePart:
         sample = pixels.frames / (pixels.frames - 1) if pixels.frames > 1 else np.nan
         self.spread = np.where(np.isnan(self.mean), np.nan, np.sqrt(weights.average(pixels.variance) * sample))
         self.noise_variance = weights.noise_factor * noise_of_differences(pixels.mean, weights.interior) ** 2
+        by_lines = ((pixels.mean.T, weights.interior.T), (pixels.mean, weights.interior))
+        for lines, (image, interior) in enumerate(by_lines):
+            if variance := variance_of_columns(image, interior):
+                self.noise_variance = self.noise_variance + variance * weights.line_factors[lines]
         varying = ~(pixels.bound_K <= AVERAGING_LIMIT_K)
         self.fell_back = (
             weights.average(varying.astype(float)) > 0 if varying.any() else np.zeros(self.mean.shape, bool)
@@ -116,6 +122,26 @@ def noise_of_differences(image: Array, interior: NDArray[np.bool_]) -> float:
     down = values[:-2] - 2 * values[1:-1] + values[2:]
     both = down[:, :-2] - 2 * down[:, 1:-1] + down[:, 2:]
     return MAD_TO_SIGMA * float(np.nanmedian(np.abs(both[interior[1:-1, 1:-1]]))) / 6
+
+
+def variance_of_columns(image: Array, interior: NDArray[np.bool_]) -> float:
+    """Variance of the noise that the pixels of every column share, of an image in any unit: what the scatter of the columns' means has
+    beyond that of their pixels; 0 where this hides it.
+    """
+    if image.size > _LARGE_PX:
+        middle = image.shape[0] // 2
+        image, interior = (one[max(middle - _NOISE_ROWS, 0) : middle + _NOISE_ROWS] for one in (image, interior))
+    # Fourth differences, of a sum of squared weights of 70, leave nothing of a smooth field.
+    used = interior[:, 1:-3] & interior[:, 3:-1]
+    across = np.where(used, np.diff(image.astype(float), 4, axis=1), np.nan)
+    count = np.isfinite(across).sum(axis=0)
+    across, count = across[:, count >= _LEAST_ROWS], count[count >= _LEAST_ROWS]
+    if count.size < _LEAST_COLUMNS:
+        return 0.0
+    means = np.nanmean(across, axis=0)
+    single = (MAD_TO_SIGMA * float(np.nanmedian(np.abs(across - means)))) ** 2 * float(np.mean(1.0 / count))
+    shared = (MAD_TO_SIGMA * float(np.median(np.abs(means)))) ** 2 - single
+    return shared / 70.0 if shared > single else 0.0
 
 
 def assemble_fields(

@@ -59,10 +59,26 @@ class PlanWeights:
     @cached_property
     def noise_factor(self) -> Array:
         """Variance of every cell, (y, x), for independent pixels of unit variance."""
-        variance = _row_squares(self.areas)
+        return self._variance(self.areas)
+
+    @cached_property
+    def line_factors(self) -> tuple[Array, Array]:
+        """Variance of every cell, (y, x), for noise of unit variance that the pixels of a row share, and of a column."""
+        place, (rows, columns) = self.areas.indices, self.used.shape
+
+        def factor(line: Array, count: int) -> Array:
+            shares = (self.areas.data, line, self.areas.indptr)
+            return self._variance(sparse.csr_array(shares, shape=(self.areas.shape[0], count), copy=True))
+
+        return factor(place // columns, rows), factor(place % columns, columns)
+
+    def _variance(self, shares: sparse.csr_array) -> Array:
+        """Variance of every cell, (y, x), from the shares in it of independent parts of the picture of unit variance."""
+        shares.sum_duplicates()
+        variance = _row_squares(shares)
         moved = np.flatnonzero(np.diff(self.centring.indptr))
         if moved.size:
-            variance[moved] = _row_squares(sparse.csr_array(self.areas[moved] + self.centring[moved] @ self.areas))
+            variance[moved] = _row_squares(sparse.csr_array(shares[moved] + self.centring[moved] @ shares))
         return self._on_plan(variance)
 
     def resample(self, values: Array, clipped: NDArray[np.bool_] | None = None) -> Array:

@@ -11,7 +11,14 @@ from tests.thermography.flir_mutations import PARAMETERS
 from tests.thermography.plan_scene import GRID, START, Scene, record, registered
 from thermography import large_arrays
 from thermography.common import ThermographyError
-from thermography.fields.cycle_fields import SURFACE_EDGE, CyclePart, assemble_fields, noise_of_differences, pixel_noise
+from thermography.fields.cycle_fields import (
+    SURFACE_EDGE,
+    CyclePart,
+    assemble_fields,
+    noise_of_differences,
+    pixel_noise,
+    variance_of_columns,
+)
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
 from thermography.fields.total_uncertainty import (
@@ -151,6 +158,18 @@ def test_noise_of_an_image_ignores_its_smooth_field(rng, shape):
     interior = np.zeros(shape, bool)
     interior[10:90, 10:110] = True
     assert noise_of_differences(image, interior) == pytest.approx(0.05, rel=0.05)
+
+
+def test_noise_of_columns_is_told_from_that_of_pixels(rng):
+    row, column = np.mgrid[:90, :160]
+    smooth = 20 + 3 * np.exp(-((row - 40) ** 2 + (column - 70) ** 2) / 200)
+    image, interior = smooth + rng.normal(0, 0.05, smooth.shape), np.ones(smooth.shape, bool)
+    interior[30:40, 50:60] = False
+    assert variance_of_columns(image, interior) == 0.0
+    # The median of 156 columns whose fourth differences resemble one another.
+    shared = variance_of_columns(image + rng.normal(0, 0.1, 160), interior)
+    assert np.sqrt(shared) == pytest.approx(0.1, rel=0.3)
+    assert variance_of_columns(image[:, :20], interior[:, :20]) == 0.0
 
 
 CAMERA = override(PARAMETERS, emissivity=0.97, object_distance_m=1.2, reflected_temperature_K=295.15)

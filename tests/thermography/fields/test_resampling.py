@@ -57,6 +57,15 @@ def test_inner_pixels_have_all_eight_neighbours(registration):
         assert narrow.interior.sum() == (shape == (3, 3))
 
 
+def test_noise_that_a_row_or_a_column_shares_falls_with_their_number_in_a_cell(registration):
+    weights = plan_weights(registration, PLAN)
+    before = weights.areas.data.copy()
+    # An inner cell of 10 x 10 pixels.
+    assert weights.noise_factor[2, 2] == pytest.approx(0.01)
+    assert [factor[2, 2] for factor in weights.line_factors] == pytest.approx([0.1, 0.1])
+    assert (weights.areas.data == before).all()
+
+
 def test_a_linear_field_is_exact_in_partly_seen_cells_too(registration):
     weights = plan_weights(registration, PLAN)
     x, y = np.moveaxis(places_mm(), -1, 0)
