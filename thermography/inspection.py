@@ -324,7 +324,9 @@ def _check_parameters(references: Sequence[FrameReference], overridden: Collecti
         and (one_camera or not name.startswith(("planck", "atmosphere_")))
     ]
     if varying:
-        yield _warning("parameters_vary", f"parameters differ between the frames: {', '.join(varying)}.")
+        ends = [(name, *(f"{of({getattr(each, name) for each in sets}):g}" for of in (min, max))) for name in varying]
+        named = ", ".join(f"{name} ({low} to {high})" for name, low, high in ends)
+        yield _warning("parameters_vary", f"parameters differ between the frames: {named}.")
     for name in ("reflected_temperature_K", "atmospheric_temperature_K"):
         value, key = getattr(p, name), name.removesuffix("_K")
         quantity, celsius = key.replace("_", " "), value - ZERO_CELSIUS_K

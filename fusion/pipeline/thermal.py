@@ -38,17 +38,18 @@ from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome, Parts
 from fusion.results.store import check
 from thermography.common import FIELDS, ZERO_CELSIUS_K, ThermographyError
-from thermography.fields.cycle_fields import CLIPPED, cycles_with_field, reference_cycle
+from thermography.fields.cycle_fields import CLIPPED, annotate, cycles_with_field, reference_cycle
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.objects import describe_unnamed_surfaces, leave_out_objects
 from thermography.fields.still import reduce_frames
 from thermography.fields.survey import (
     LEAST_SURROUNDING_BLOCKS,
     Blocks,
+    DiscLevels,
     Survey,
-    compare_discs,
     disturbed_frames,
     locate_blocks,
+    read_discs,
     survey_frames,
 )
 from thermography.fields.total_uncertainty import (
@@ -86,7 +87,7 @@ from thermography.radiometry.uncertainty import (
 )
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
 from thermography.registration.plan import Polygon
-from thermography.registration.register import Registration, RegistrationError, register
+from thermography.registration.register import Registration, RegistrationError, register, with_optics_of
 
 # The camera before the fields are made: damaged frames are left out, steps and drift of its zero are taken out.
 
@@ -133,20 +134,10 @@ class CameraState:
             if inside.any():
                 u, reflected_u = (np.sqrt(np.mean(one[inside] ** 2)) for one in (self.u_K, reflected))
                 values[:, cycle] = correction[inside].mean(), u, reflected_u
-        kelvin = {"units": "K", "units_metadata": "temperature: difference"}
-        named = "camera's zero since the first frame"
-        correction_of = {"long_name": f"correction of the {named}, contained in the temperatures", **kelvin}
-        correction_of["ancillary_variables"] = "camera_correction_u"
-        u_of = {"long_name": f"standard uncertainty of the {named} after the correction", **kelvin}
-        u_of["comment"] = "common to all cells of a frame"
-        variables = {
-            "camera_correction": ("cycle", values[0], correction_of),
-            "camera_correction_u": ("cycle", values[1], u_of),
-        }
-        if self.reflected_u_K is not None:
-            named = "standard uncertainty of the change of the reflected temperature since the first frame"
-            variables["reflected_change_u"] = ("cycle", values[2], {"long_name": named, **kelvin})
-        return xr.Dataset(variables)
+        found = dict(zip(("camera_correction", "camera_correction_u", "reflected_change_u"), values, strict=True))
+        if self.reflected_u_K is None:
+            del found["reflected_change_u"]
+        return xr.Dataset({name: ("cycle", one) for name, one in found.items()})
 
 
 def counter(report: Report, label: str, total: int) -> Callable[[int], None]:
@@ -251,13 +242,16 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
 
 
 def _held_against_discs(
-    camera: CameraState, registration: Registration, detector: Detector
+    camera: CameraState, levels: DiscLevels, fields: xr.Dataset
 ) -> tuple[CameraState, dict[str, Any]]:
     """The camera with what the discs show of its zero in its uncertainty, and what they show of a pattern in the picture."""
     source = camera.source
-    shown = compare_discs(source.frames, registration, detector)
+    left_out = {
+        name for kind in ("frames_obstructed", "frames_shaken") for name in json.loads(fields.attrs.get(kind, "[]"))
+    }
+    shown = levels.compared(np.array([f"{one.path.name}#{one.index}" in left_out for one in source.frames]))
     if shown is None:
-        return camera, {"untested": "fewer than five discs of low emissivity are in view, or few frames"}
+        return camera, {"untested": "fewer than five sharp discs of low emissivity are in view, or few frames"}
     change = np.ptp(shown.pattern_K, axis=0)
     strongest = int(np.argmax(change))
     found = {
@@ -275,14 +269,18 @@ def _held_against_discs(
         return camera, found
     room = _room(source)[shown.index]
     if room.shape[1]:
-        # Discs reflect the room, whose surfaces change by no more than its air.
+        # Discs reflect the room, whose surfaces change by no more than its air; a steady drift beside it is the zero's.
         room = room - room[0]
-        left = left - room @ scipy.optimize.lsq_linear(room, left, (0.0, 1.0)).x
+        design = np.column_stack([shown.index / shown.index[-1], room])
+        most = np.array([np.inf, *np.ones(room.shape[1])])
+        found_in = scipy.optimize.lsq_linear(design, left, (np.where(most > 1.0, -np.inf, 0.0), most)).x
+        left = left - room @ found_in[1:]
         left -= left[0]
     # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7), but no more than
     # the surroundings show, which share the zero.
     zero_u_K = np.minimum(np.interp(every, shown.index, np.abs(left)), camera.surroundings_K) / np.sqrt(3.0)
-    u_K = np.maximum(camera.u_K, zero_u_K)
+    pattern_u_K = np.sqrt(np.mean((shown.pattern_K - shown.pattern_K[0]) ** 2, axis=1))
+    u_K = np.hypot(np.maximum(camera.u_K, zero_u_K), np.interp(every, shown.index, pattern_u_K))
     part = camera.part.model_copy(update={"largest_u_K": float(u_K.max())})
     return replace(camera, u_K=u_K, part=part), {**found, "zero_K": float(np.ptp(left))}
 
@@ -329,7 +327,11 @@ def _series(source: CameraInputs, background: Array, table: Array) -> LevelSerie
     seconds = (times - times[0]) / np.timedelta64(1, "s")
     sensors = [name for name in frames[0].housekeeping if all(name in frame.housekeeping for frame in frames)]
     housing = np.array([[frame.housekeeping[name] for name in sensors] for frame in frames], float)
-    return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), _room(source))
+    log, logged_s = source.environment, 0.0
+    if log is not None:
+        first = camera_on_laser_clock(times[:1], source.thermography.clock_offset_s or 0.0)[0]
+        logged_s = max(float((first - log["time"].values[0]) / np.timedelta64(1, "s")), 0.0)
+    return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), _room(source), logged_s)
 
 
 def _room(source: CameraInputs) -> Array:
@@ -345,9 +347,8 @@ def _room(source: CameraInputs) -> Array:
 
 def repeat_notices(repeated: NDArray[np.bool_], times: Sequence[np.datetime64] | Array) -> Iterator[Notice]:
     """Return one notice for frames that the camera wrote twice."""
-    flags = find_repeats(repeated, np.array(times, "datetime64[ms]"))
-    if flags:
-        yield Notice.of("frames_repeated", named=listed(f"{utc(flag.time)}: {flag.message}" for flag in flags))
+    if found := find_repeats(repeated):
+        yield Notice.of("frames_repeated", named=listed(f"{utc(times[first])}: {text}" for first, text in found))
 
 
 _NO_SURROUNDINGS = Notice.of("camera_unchecked")
@@ -505,13 +506,17 @@ def _budget(
     middle = mean - 0.5 * float(last["temperature_rise"].mean())
     to_temperature = common_contributions(mean, camera, inputs)
     to_rise = rise_scale_contributions(middle, camera, inputs)
-    entries = []
+    left_K, entries = _zero_left_K(fields), []
+    # What changes during a test is in no single temperature: as the frames show it, or as it is stated or assumed.
+    of_frames = {"camera_drift_K": left_K if left_K > inputs.camera_drift_K else None, "reflected_change_K": None}
+    if "reflected_change_u" in fields:
+        of_frames["reflected_change_K"] = float(np.nan_to_num(fields["reflected_change_u"].values).max())
     for name, key in _STATED.items():
-        if name == "camera_drift_K":
-            entries.append(_zero_entry(table, fields, inputs))
-            continue
-        if name == "reflected_change_K":
-            entries.append(_reflected_entry(table, fields, inputs))
+        if name in of_frames:
+            found_K, stated = of_frames[name], "assumed" if getattr(table, key) is None else "stated"
+            left = {"value": None, "u": getattr(inputs, name), "source": stated}
+            left |= {} if found_K is None else {"u": found_K, "source": "measured"}
+            entries.append(BudgetEntry(input=name, **left, temperature_u_K=0.0, rise_u_percent=None))
             continue
         if camera.window_transmission == 1 and name.startswith("window_") and getattr(inputs, name) == 0:
             continue
@@ -522,23 +527,6 @@ def _budget(
         value, u = getattr(camera, name, None), getattr(inputs, name)
         entries.append(BudgetEntry(input=name, value=value, u=u, source=source, **contributed))
     return entries
-
-
-def _zero_entry(table: ThermographyTable, fields: xr.Dataset, inputs: InputUncertainty) -> BudgetEntry:
-    """The entry of the budget for the camera's zero: what its correction leaves, or the drift that is stated or assumed."""
-    left_K, given_K = _zero_left_K(fields), inputs.camera_drift_K
-    source = "measured" if left_K > given_K else "assumed" if table.camera_drift_u_K is None else "stated"
-    zero = {"input": "camera_drift_K", "value": None, "u": max(left_K, given_K), "source": source}
-    return BudgetEntry(**zero, temperature_u_K=0.0, rise_u_percent=None)
-
-
-def _reflected_entry(table: ThermographyTable, fields: xr.Dataset, inputs: InputUncertainty) -> BudgetEntry:
-    """The entry of the budget for a change of what the table reflects: what log or discs show of it, or what is stated or assumed."""
-    u_K, source = inputs.reflected_change_K, "assumed" if table.reflected_change_u_K is None else "stated"
-    if "reflected_change_u" in fields:
-        u_K, source = float(np.nan_to_num(fields["reflected_change_u"].values).max()), "measured"
-    entry = {"input": "reflected_change_K", "value": None, "u": u_K, "source": source}
-    return BudgetEntry(**entry, temperature_u_K=0.0, rise_u_percent=None)
 
 
 def _zero_left_K(fields: xr.Dataset) -> float:
@@ -616,7 +604,12 @@ def taken_from_laser(source: CameraInputs) -> list[Any]:
 
 def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
     """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle."""
-    override = Overrides(overridden_parameters(source.thermography))
+    # One surface has one emissivity: where the files change it, that of the first frame holds.
+    first_emissivity = source.frames[0].parameters.emissivity
+    stated = overridden_parameters(source.thermography)
+    if any(frame.parameters.emissivity != first_emissivity for frame in source.frames):
+        stated.setdefault("emissivity", first_emissivity)
+    override = Overrides(stated)
     survey = survey_campaign(source, override, report=report)
     report("registration", 0, 1)
     # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
@@ -636,18 +629,30 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     report("registration", 1, 1)
     camera = examine_camera(source, survey, registration)
     source, notices = camera.source, camera.notices
+    still = source.thermography.table == "still"
+    levels = read_discs(source.frames, registration, source.grid, detector) if still else None
+    blurred_since = None
+    if levels is not None and levels.blurred is not None:
+        first_blurred, widest = levels.blurred
+        some = source.frames[max(widest - 2, 0) : widest + 3]
+        mean = np.mean([calibrate(detector.read(frame), override(frame)) for frame in some], axis=0)
+        focused, registration = registration, with_optics_of(mean, registration, source.grid)
+        if registration is not focused:
+            blurred_since = source.frames[first_blurred].time
     notices += pixel_notices(detector.flags, "are left out of the fields")
     fields, offset_s, offset_u_s, clock_notices = _reduce_on_clock(
         camera, registration, override, detector, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
     notices += _clipped_notices(fields, detector, override(first[0]))
     shown: dict[str, Any] = {"untested": "camera or table was displaced, and the discs in the picture with it"}
-    if source.thermography.table == "moving":
+    if levels is None:
         shown = {"untested": "the discs move through the picture with the table"}
     else:
         fields = leave_out_objects(fields)
-        if not json.loads(fields.attrs.get("knocks", "[]")):
-            camera, shown = _held_against_discs(camera, registration, detector)
+        if blurred_since is not None:
+            shown = {"untested": "the discs blur during the test"}
+        elif not json.loads(fields.attrs.get("knocks", "[]")):
+            camera, shown = _held_against_discs(camera, levels, fields)
     fields = fields.assign_attrs(discs=json.dumps(shown))
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
     damaged = [f"{Path(one.file).name}#{one.index}" for one in camera.part.frames_damaged]
@@ -656,10 +661,15 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     fields = fields.assign_coords(cycle=source.cycles.number)
     completed = complete_fields(source, fields, override, offset_s=offset_s)
     fields = check(completed.dataset, FIELDS, name="the fields")
-    if source.thermography.table == "still":
+    if still:
         unnamed = describe_unnamed_surfaces(fields, override(first[0]))
         fields = fields.assign_attrs(unnamed_surfaces=json.dumps(unnamed))
-    notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
+    notices += [
+        *clock_notices,
+        *_registration_notices(registration, blurred_since),
+        *_frame_notices(fields),
+        *completed.notices,
+    ]
     for name in ("time", "cycle_time", "frame_time"):
         if name in fields.variables:
             moved = camera_on_laser_clock(fields[name].values, offset_s)
@@ -790,33 +800,28 @@ def pixel_notices(flags: np.ndarray, treatment: str) -> Iterator[Notice]:
 
 def _registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
     """Return the registration as variables: the fiducials with their errors, the homography, and the frame it was made on."""
-    degrees = {"units": "degC", "units_metadata": "temperature: on_scale"}
     names = list(registration.located)
     places = [registration.located[name] for name in names]
     fiducials = [registration.fiducials[name] for name in names]
     along = {
-        "fiducial_x": ([fiducial.x_mm for fiducial in fiducials], "mm"),
-        "fiducial_y": ([fiducial.y_mm for fiducial in fiducials], "mm"),
-        "fiducial_column": ([located.column_px for located in places], "1"),
-        "fiducial_row": ([located.row_px for located in places], "1"),
-        "fiducial_residual": ([registration.residual_mm[name] for name in names], "mm"),
-        "fiducial_leave_one_out": ([registration.leave_one_out_mm[name] for name in names], "mm"),
+        "fiducial_name": names,
+        "fiducial_x": [fiducial.x_mm for fiducial in fiducials],
+        "fiducial_y": [fiducial.y_mm for fiducial in fiducials],
+        "fiducial_column": [located.column_px for located in places],
+        "fiducial_row": [located.row_px for located in places],
+        "fiducial_residual": [registration.residual_mm[name] for name in names],
+        "fiducial_leave_one_out": [registration.leave_one_out_mm[name] for name in names],
     }
-    variables: dict[str, Any] = {name: ("fiducial", values, {"units": unit}) for name, (values, unit) in along.items()}
-    projection = registration.projection
+    variables: dict[str, Any] = {name: ("fiducial", values) for name, values in along.items()}
     placed_by = {
-        "units": "1",
-        "long_name": "homography from sensor (column, row) without lens distortion, px, to plan (x, y), mm, of the first registration",
         "lens_model": registration.model,
-        "distortion_k1_k2_p1_p2": projection.distortion,
-        "focal_length_px": projection.focal_length_px,
-        "principal_point_px": projection.principal_point_px,
-        "comment": "sensor places are distorted as by OpenCV: k1, k2, p1, p2 of (place - principal point) / focal length",
+        "distortion_k1_k2_p1_p2": registration.projection.distortion,
+        "focal_length_px": registration.projection.focal_length_px,
+        "principal_point_px": registration.projection.principal_point_px,
     }
     variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, placed_by)
-    variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
-    variables["fiducial_name"] = ("fiducial", names)
-    return xr.Dataset(variables)
+    variables["reference_frame"] = (("row", "column"), reference.astype("f4"))
+    return annotate(xr.Dataset(variables))
 
 
 def _describe_registration(registration: Registration, source: CameraInputs) -> RegistrationPart:
@@ -825,15 +830,8 @@ def _describe_registration(registration: Registration, source: CameraInputs) -> 
     places = [registration.fiducials[name] for name in registration.leave_one_out_mm]
     hull = cv2.convexHull(np.array([(place.x_mm, place.y_mm) for place in places], dtype=np.float32))
     same = (
-        "model",
-        "rms_mm",
-        "unchecked",
-        "contradicted_hints",
-        "mirrored",
-        "area_ratio",
-        "leave_one_out_mm",
-        "margin_px",
-    )
+        "model", "rms_mm", "unchecked", "contradicted_hints", "mirrored", "area_ratio", "leave_one_out_mm", "margin_px"
+    )  # fmt: skip
     optics = registration.optics
     return RegistrationPart(
         **{name: getattr(registration, name) for name in same},
@@ -856,7 +854,7 @@ def _describe_registration(registration: Registration, source: CameraInputs) -> 
 _SHARP_PX = 1.2
 
 
-def _registration_notices(registration: Registration) -> Iterator[Notice]:
+def _registration_notices(registration: Registration, blurred_since: np.datetime64 | None) -> Iterator[Notice]:
     """Return one notice for all fiducials that were not used, one for a blurred picture."""
     optics = registration.optics
     if optics.spread_px > _SHARP_PX:
@@ -864,6 +862,7 @@ def _registration_notices(registration: Registration) -> Iterator[Notice]:
         lost_mm = registration.margin_px / float(registration.projection.px_per_mm(middle))
         yield Notice.of(
             "frames_blurred",
+            since=f" from {utc(blurred_since)} on" if blurred_since else "",
             spread_px=optics.spread_px,
             spread_u_px=optics.spread_u_px,
             focused_px=_SHARP_PX,
@@ -884,9 +883,12 @@ def _frame_notices(fields: xr.Dataset) -> Iterator[Notice]:
     """Return one notice for each kind of frame that the reduction reports."""
     for name in _FRAME_ATTRIBUTES:
         frames = json.loads(fields.attrs.get(name, "[]"))
-        if frames:
-            named = listed([frame if isinstance(frame, str) else _words(frame) for frame in frames])
-            yield Notice.of(name, frames=counted(len(frames), "frame"), named=named)
+        crept = [bool(frame.pop("crept")) for frame in frames] if name == "knocks" else [False] * len(frames)
+        for code, chosen in ((name, np.logical_not(crept)), ("camera_creeps", crept)):
+            some = list(compress(frames, chosen))
+            if some:
+                named = listed([frame if isinstance(frame, str) else _words(frame) for frame in some])
+                yield Notice.of(code, frames=counted(len(some), "frame"), named=named)
 
 
 def _words(value: Any) -> str:

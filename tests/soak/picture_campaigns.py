@@ -225,6 +225,17 @@ class Knock(Fault):
         return replace(camera, shift_mm=camera.shift_mm + moved)
 
 
+@dataclass(frozen=True)
+class Creep(Fault):
+    """The camera's picture shifts steadily over the test, by so many pixels at its end."""
+
+    shift_px: tuple[float, float]
+
+    def seen_from(self, camera: View, now: Now) -> View:
+        moved = np.array([*self.shift_px, 0.0]) * now.share * camera.shift_mm[2] / camera.focal_px
+        return replace(camera, shift_mm=camera.shift_mm + moved)
+
+
 #: Counts per kelvin at the table.
 _SLOPE = float(signal(24.5) - signal(23.5))
 
@@ -234,13 +245,14 @@ def _to_counts(image: Array) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _rays(size: tuple[int, int], pose: bytes, focal_px: float) -> tuple[Array, Array]:
+def _rays(size: tuple[int, int], pose: bytes, focal_px: float) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Plan points of a camera, mm, and which of them lie on the table."""
     values = np.frombuffer(pose)
     camera = View(values[:9].reshape(3, 3), values[9:12], focal_px, values[12:], size)
     offsets = (np.arange(_FINE) + 0.5) / _FINE - 0.5
     column, row = np.meshgrid(*((np.arange(n)[:, None] + offsets).ravel() for n in reversed(size)))
     x, y = camera.to_plan(np.stack([column, row], axis=-1).reshape(-1, 2)).T
-    return x, y
+    return x, y, np.flatnonzero((x >= 0) & (x <= GRID.width_mm) & (y >= 0) & (y <= GRID.height_mm))
 
 
 @dataclass(frozen=True)
@@ -287,16 +299,18 @@ class Campaign:
         rng = np.random.default_rng((self.seed, 2, now.frame))
         camera = reduce(lambda one, fault: fault.seen_from(one, now), self.faults, self.camera)
         pose = np.concatenate([camera.turn.ravel(), camera.shift_mm, camera.lens])
-        x, y = _rays(camera.shape, pose.tobytes(), camera.focal_px)
-        on_table = (x >= 0) & (x <= GRID.width_mm) & (y >= 0) & (y <= GRID.height_mm)
-        celsius = np.full(x.shape, ROOM_C)
-        celsius[on_table] = self.celsius(x[on_table], y[on_table], now.seconds)
-        emissivity = np.where(on_table, EMISSIVITY, 0.95)
+        x, y, on_table = _rays(camera.shape, pose.tobytes(), camera.focal_px)
+        plan_x, plan_y = x[on_table], y[on_table]
+        own = self.celsius(plan_x, plan_y, now.seconds)
+        emissivity_of = np.full(on_table.size, EMISSIVITY)
         for place in self.places:
-            emissivity[np.hypot(x - place[0], y - place[1]) < self.disc_mm / 2] = DISC_EMISSIVITY
+            across = np.flatnonzero(np.abs(plan_x - place[0]) < self.disc_mm / 2)
+            on_disc = np.hypot(plan_x[across] - place[0], plan_y[across] - place[1]) < self.disc_mm / 2
+            emissivity_of[across[on_disc]] = DISC_EMISSIVITY
         for fault in self.faults:
-            celsius, emissivity = fault.surface(x, y, celsius, emissivity, now)
-        rays = emissivity * signal(celsius) + (1 - emissivity) * signal(REFLECTED_C)
+            own, emissivity_of = fault.surface(plan_x, plan_y, own, emissivity_of, now)
+        rays = np.full(x.shape, 0.95 * float(signal(ROOM_C)) + 0.05 * float(signal(REFLECTED_C)))
+        rays[on_table] = emissivity_of * signal(own) + (1 - emissivity_of) * signal(REFLECTED_C)
         rows, columns = camera.shape
         image = np.asarray(rays.reshape(rows, _FINE, columns, _FINE).mean(axis=(1, 3)))
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), self.blur_px))
@@ -351,14 +365,15 @@ def write(campaign: Campaign, folder: Path, *, regions: str = "") -> Path:
 def _readings(campaign: Campaign, rng: np.random.Generator) -> list[str]:
     """An axis that expands with the table below it and shifts with the mean of the whole."""
     lines = ["cycle,direction,target,position_mm,time,deviation_um"]
-    start = campaign.truth(0.0)
+    x, y = np.meshgrid(GRID.x_mm[::2], GRID.y_mm[::2])
+    start = campaign.celsius(x, y, 0.0)
     for cycle in range(campaign.cycles):
         order = [*range(_TARGETS_MM.size), *reversed(range(_TARGETS_MM.size))]
         for step, target in enumerate(order):
             seconds = campaign.cycle_s * (cycle + 0.05 + 0.9 * step / len(order))
-            rise = campaign.truth(seconds) - start
+            rise = campaign.celsius(x, y, seconds) - start
             along = np.interp(_TARGETS_MM[target], [0.0, 300.0], [0.0, 1.0])
-            line = float(rise[18, 40:100].mean())
+            line = float(rise[9, 20:50].mean())
             drift = 3.0 * float(rise.mean()) + along * 0.3 * 11.7 * line
             direction = "positive" if step < _TARGETS_MM.size else "negative"
             deviation = drift + 0.8 * np.sin(target) + rng.normal(0, 0.2)

@@ -111,7 +111,7 @@ def test_changes_within_a_file_give_a_warning(tmp_path):
     write_sequence(tmp_path / "a.seq", [first, second, other])
     messages = {each.code: each.message for each in inspect_file(tmp_path / "a.seq").warnings}
     assert set(messages) == {"parameters_vary", "several_cameras"}
-    assert messages["parameters_vary"] == "parameters differ between the frames: emissivity."
+    assert messages["parameters_vary"] == "parameters differ between the frames: emissivity (0.5 to 0.95)."
 
 
 def test_damage_gives_a_warning(tmp_path):

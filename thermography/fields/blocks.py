@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermography.common import Array, ThermographyError
 from thermography.fields.cycle_fields import noise_of_differences
 from thermography.fields.resampling import PlanWeights
-from thermography.io.frame import CameraParameters, FrameReference, PlainFrame, PlainSamples, StoredPixels
+from thermography.io.frame import CameraParameters, FrameReference
 from thermography.io.sequence import FrameList, WindowReader
 from thermography.radiometry.averaging import (
     AVERAGING_LIMIT_K,
@@ -218,7 +216,9 @@ def cut_blocks(
     return blocks
 
 
-def reduce_block(frames: Sequence[StoredPixels], parameters: CameraParameters, sensor: RegisteredSensor) -> BlockResult:
+def reduce_block(
+    frames: Sequence[FrameReference], parameters: CameraParameters, sensor: RegisteredSensor
+) -> BlockResult:
     """Read the frames of a block and reduce them."""
     weights = sensor.weights
     sums = Accumulator(weights.used.shape)
@@ -254,7 +254,7 @@ def reduce_block(frames: Sequence[StoredPixels], parameters: CameraParameters, s
 def _calibrate_per_frame(
     mean: MeanTemperature,
     varying: Array,
-    frames: Sequence[StoredPixels],
+    frames: Sequence[FrameReference],
     parameters: CameraParameters,
     window: tuple[slice, slice],
 ) -> None:
@@ -272,45 +272,3 @@ def _calibrate_per_frame(
         offset = total / count
         mean.variance[varying] = np.maximum(squares / count - offset**2, 0.0)
     mean.mean[varying] = reference + offset
-
-
-# Frames on their way to another process: of video, only where the pixels stand, some bytes per frame.
-
-
-class FrameRun(Sequence[StoredPixels]):
-    """Some frames in order; sent to another process, frames of plain samples in one file become a table of their places."""
-
-    def __init__(self, frames: Sequence[StoredPixels]) -> None:
-        self._frames = frames
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __iter__(self) -> Iterator[StoredPixels]:
-        return iter(self._frames)
-
-    def __getitem__(self, place: Any) -> Any:
-        return self._frames[place]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        first = self._frames[0] if self._frames else None
-        samples = [frame.plain_samples for frame in self._frames]
-        plain = [place for place in samples if place is not None]
-        if (
-            first is None
-            or len(plain) < len(samples)
-            or any(frame.path != first.path or frame.shape != first.shape for frame in self._frames)
-            or len({place.little_endian for place in plain}) > 1
-        ):
-            return FrameRun, (list(self._frames),)
-        offsets = np.array([place.offset for place in plain], np.int64)
-        indices = np.array([frame.index for frame in self._frames], np.int64)
-        return _restore, (first.path, first.shape, plain[0].little_endian, indices, offsets)
-
-
-def _restore(
-    path: Path, shape: tuple[int, int], little_endian: bool, indices: NDArray[np.int64], offsets: NDArray[np.int64]
-) -> FrameRun:
-    """Return the frames of a table of places."""
-    places = zip(indices.tolist(), offsets.tolist(), strict=True)
-    return FrameRun([PlainFrame(path, index, shape, PlainSamples(offset, little_endian)) for index, offset in places])

@@ -25,7 +25,6 @@ from thermography.fields.blocks import (
     NO_CYCLE,
     Block,
     BlockResult,
-    FrameRun,
     FrameSeries,
     Override,
     ReductionError,
@@ -142,6 +141,8 @@ _OFF_SIGMAS = 8.0
 _OFF_SHARE = 0.02
 #: An obstruction passes within this time, s, or this number of frames; what stays longer is a change of the scene.
 _PASSING_S, _PASSING_FRAMES = 900.0, 5
+#: Frames before a lasting displacement that show whether it had begun.
+_CREPT_FRAMES = 3
 #: Number of frames whose median is the first state of the table.
 _FIRST_FRAMES = 5
 #: Least number of sampled pixels for the comparison.
@@ -396,7 +397,7 @@ class BlockFrames(NamedTuple):
     """A block with those of its frames that show the table, their times (frames,) datetime64 and their corrections (frames,) K."""
 
     block: Block
-    frames: FrameRun
+    frames: Sequence[FrameReference]
     times: Array
     correction_K: Array
 
@@ -451,7 +452,7 @@ def gather_frames(frames: FrameSeries, blocks: Iterable[Block]) -> list[BlockFra
 
 def choose_frames(frames: FrameSeries, block: Block, chosen: Array) -> BlockFrames:
     """Return some frames of a block, (n,) indices, for `reduce_portion`."""
-    references = FrameRun([frames.references[i] for i in chosen])
+    references = [frames.references[i] for i in chosen]
     return BlockFrames(block, references, frames.times[chosen], frames.correction_K[chosen])
 
 
@@ -538,9 +539,9 @@ def reduce_frames(
         Variables of `thermography.common.FIELDS` with dimensions (cycle, y, x) in degC and K, coordinates in mm, but for the total
         uncertainties, which `thermography.fields.total_uncertainty.evaluate_uncertainty` adds; further `temperature_rate`,
         `quality_flag`, `position_u`, and as JSON texts the attributes `frames_outside_cycles` (their fields are in the stack),
-        `knocks` (frame, shift in px, zoom, turn), `frames_shaken` (displaced alone, left out), `frames_obstructed` (something before
-        the table, left out), `frames_unchecked` (too little contrast to locate the fiducials) and `unchecked_stretches` (of such
-        frames, after which no frame shows that the registration held).
+        `knocks` (frame, shift in px, zoom, turn, whether it crept), `frames_shaken` (displaced alone, left out), `frames_obstructed`
+        (something before the table, left out), `frames_unchecked` (too little contrast to locate the fiducials) and
+        `unchecked_stretches` (of such frames, after which no frame shows that the registration held).
 
     Raises
     ------
@@ -813,10 +814,16 @@ class StillReduction:
     def _knock(self, span: RegistrationSpan, before: RegistrationSpan) -> dict[str, Any]:
         """What is reported of the knock before a registration span."""
         zoom, turn_deg = zoom_and_turn(span.displacement_px, before.registration)
+        # A knock comes from one frame to the next; what creeps was displaced already.
+        last_px = self.displacement.size_px[
+            max(before.first_frame, span.first_frame - _CREPT_FRAMES) : span.first_frame
+        ]
+        crept = np.nan_to_num(last_px).max(initial=0.0) > float(np.linalg.norm(span.displacement_px)) / 2
         return {
             "frame": self.frames.name(span.first_frame),
             "index": span.first_frame,
             "shift_px": list(span.displacement_px[:2]),
             "zoom": zoom,
             "turn_deg": turn_deg,
+            "crept": bool(crept),
         }

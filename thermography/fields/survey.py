@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import cv2
 import numpy as np
@@ -27,8 +28,8 @@ from thermography.radiometry.planck import (
     signal_slope,
     temperature_from_counts,
 )
-from thermography.registration.plan import Fiducial, PlanGrid
-from thermography.registration.register import Registration
+from thermography.registration.plan import PlanGrid
+from thermography.registration.register import Registration, fiducial_weights
 
 #: Blocks along a row: large enough that noise averages out, small enough that many lie outside the table.
 _BLOCKS_ACROSS = 24
@@ -341,16 +342,64 @@ _COMPARED = 60
 _DULL = 0.6
 #: Fewest discs that show a pattern beside a change that all share and the warming of the table.
 _LEAST_DISCS = 5
-#: Radii of the middle of a disc, and of the ring of table around it, over that of the disc: the lens blurs the rim.
-_CORE, _RING = 0.6, (1.6, 2.6)
-#: Frames over whose mean a course is judged: what the camera adds changes slowly.
+#: Radius from which a disc shows more of itself than of the table, edge spreads.
+_LEAST_RADIUS = 3.0
+#: Frames over whose mean a course is judged: what the camera adds, and its focus, change slowly.
 _SMOOTHED = 5
+#: Growth of the edge spread beyond which it is measured again.
+_WIDER = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class DiscLevels:
+    """What frames `index` of a series show at k discs, (n, k) K: changes of the table at the centre and of the disc, by one calibration;
+    (k,) their distance from the middle of the picture, px; and (n,) by how much the edges of most are wider than at first, as a share.
+    """
+
+    index: NDArray[np.intp]
+    names: tuple[str, ...]
+    table_K: Array
+    disc_K: Array
+    off_centre_px: Array
+    wider: Array
+
+    @property
+    def blurred(self) -> tuple[int, int] | None:
+        """First frame whose edges are wider, and that with the widest; None where none are."""
+        beyond = np.flatnonzero(self.wider > _WIDER)
+        return (int(self.index[beyond[0]]), int(self.index[self.wider.argmax()])) if beyond.size else None
+
+    def compared(self, left_out: NDArray[np.bool_]) -> DiscCourses | None:
+        """Compare the discs with the table around them in frames that are not left out; None where too few are of low emissivity."""
+        kept = ~left_out[self.index]
+        disc, table = self.disc_K[kept], self.table_K[kept]
+        if len(self.names) < _LEAST_DISCS or np.count_nonzero(kept) < _LEAST_FRAMES:
+            return None
+        # The share of the table's change that a disc shows: from what differs between discs and frames, which no change of the zero does,
+        # nor one that grows with the distance from the middle.
+        alike = np.ones((len(self.names), 1))
+        smooth = np.column_stack([alike, self.off_centre_px**2])
+        own, around = (_beside(values, smooth) for values in (disc, table))
+        share = float((own * around).sum() / max((around**2).sum(), np.finfo(float).tiny))
+        if share > _DULL:
+            return None
+        added = (disc - max(share, 0.0) * table) / (1.0 - max(share, 0.0))
+        courses = scipy.ndimage.uniform_filter1d(_beside(added, alike), _SMOOTHED, axis=0, mode="nearest")
+        scores, sizes, places = np.linalg.svd(courses, full_matrices=False)
+        return DiscCourses(
+            self.index[kept],
+            added.mean(axis=1) - added[0].mean(),
+            # Noise makes a second pattern about as strong as the first.
+            np.sqrt(sizes[0] ** 2 - sizes[1] ** 2) * np.outer(scores[:, 0], places[0]),
+            float(np.ptp(table, axis=0).max()),
+            self.names,
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class DiscCourses:
     """What n frames of a series show on k discs beyond the warming of the table, K: the change since the first that all discs share, what
-    differs from disc to disc (n, k), and the largest change of the table around a disc, of which the lens mixes some per cent into it.
+    differs from disc to disc (n, k), and the largest change of the table at a disc.
     """
 
     index: NDArray[np.intp]
@@ -360,67 +409,40 @@ class DiscCourses:
     names: tuple[str, ...]
 
 
-def compare_discs(
-    frames: Sequence[FrameReference], registration: Registration, detector: Detector | None = None
-) -> DiscCourses | None:
-    """Compare the discs with the table around them; None where too few are of low emissivity and not clipped."""
-    masks = _disc_masks(registration)
+def read_discs(
+    frames: Sequence[FrameReference], registration: Registration, grid: PlanGrid, detector: Detector
+) -> DiscLevels:
+    """Read the discs of a still table, apart from those with clipped pixels, in frames that represent a series."""
     index = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _COMPARED)).round().astype(np.intp))
-    if len(masks) < _LEAST_DISCS or index.size < _LEAST_FRAMES:
-        return None
-    detector = detector or Detector.sound(registration.shape)
-    if detector.clips:
-        clipped = np.any([detector.clipped(frames[i].read_counts()) for i in index], axis=0) & ~detector.bad
-        masks = {name: pair for name, pair in masks.items() if not any(clipped[mask].any() for mask in pair)}
-        if len(masks) < _LEAST_DISCS:
-            return None
-    pictures = (detector.read(frames[i]) for i in index)
-    counts = np.array([[[picture[mask].mean() for mask in pair] for pair in masks.values()] for picture in pictures])
-    parameters = frames[0].parameters
-    for place, i in enumerate(index):
-        taken = frames[i].parameters
+    least_px, located = np.pi * (_LEAST_RADIUS * registration.optics.spread_px) ** 2, registration.located
+    weights = {
+        name: found for name, found in fiducial_weights(registration, grid).items() if located[name].area_px > least_px
+    }
+    parameters, sums, clipped = frames[0].parameters, [], np.zeros(registration.shape, bool)
+    for i in index:
+        read, taken = detector.read(frames[i]), frames[i].parameters
+        clipped, picture = clipped | detector.clipped(read), read.astype(float)
         # Another range of the camera counts otherwise: what the first one would have counted.
         if (taken.planck_r1, taken.planck_o) != (parameters.planck_r1, parameters.planck_o):
-            counts[place] = counts_from_temperature(temperature_from_counts(counts[place], taken), parameters)
+            picture = counts_from_temperature(temperature_from_counts(picture, taken), parameters)
+        sums.append([np.tensordot(one, picture[window], 2) for window, one in weights.values()])
+    shown = np.array([not clipped[window][one.any(axis=0)].any() for window, one in weights.values()], bool)
+    counts: Array = np.array(sums).reshape(len(index), -1, 5)[:, shown]
+    names = tuple(compress(weights, shown))
+    if not names:
+        nothing = np.zeros((len(index), 0))
+        return DiscLevels(index, names, nothing, nothing, np.zeros(0), np.zeros(len(index)))
+    level, contrast, _, _, by_spread = np.moveaxis(counts, -1, 0)
     gain, _ = count_line(parameters)
-    level = temperature_from_counts(counts[..., 1].mean(), parameters) + ZERO_CELSIUS_K
-    disc, table = np.moveaxis((counts - counts[0]) / (gain * signal_slope(level, parameters)), -1, 0)
-    # The share of the table's change that a disc shows: from what differs between discs and frames, which no change of the zero does.
-    own, around = (_beside(values) for values in (disc, table))
-    share = float((own * around).sum() / max((around**2).sum(), np.finfo(float).tiny))
-    if share > _DULL:
-        return None
-    added = (disc - max(share, 0.0) * table) / (1.0 - max(share, 0.0))
-    smooth = scipy.ndimage.uniform_filter1d(_beside(added), _SMOOTHED, axis=0, mode="nearest")
-    scores, sizes, places = np.linalg.svd(smooth, full_matrices=False)
-    return DiscCourses(
-        index,
-        added.mean(axis=1) - added[0].mean(),
-        sizes[0] * np.outer(scores[:, 0], places[0]),
-        float(np.ptp(table, axis=0).max()),
-        tuple(masks),
-    )
+    scale = gain * signal_slope(temperature_from_counts(level.mean(), parameters) + ZERO_CELSIUS_K, parameters)
+    table = (level - level[0]) / scale
+    wider = scipy.ndimage.uniform_filter1d(np.median(by_spread / contrast, axis=1), _SMOOTHED, mode="nearest")
+    places = np.array([(located[name].column_px, located[name].row_px) for name in names])
+    off_centre = np.hypot(*(places - (np.array(registration.shape[::-1]) - 1) / 2).T)
+    return DiscLevels(index, names, table, table + (contrast - contrast[0]) / scale, off_centre, wider - wider[0])
 
 
-def _beside(values: Array) -> Array:
-    """What is neither common to all discs of a frame nor constant on a disc."""
+def _beside(values: Array, over_discs: Array) -> Array:
+    """What is neither constant on a disc nor, in a frame, a sum of columns (k, m) over the discs."""
     values = values - values.mean(axis=0)
-    return np.asarray(values - values.mean(axis=1, keepdims=True))
-
-
-def _disc_masks(registration: Registration) -> dict[str, tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Pixels of the middle of every disc in use, and of the table around it."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
-    circle = np.column_stack([np.cos(turn), np.sin(turn)])
-
-    def inside(disc: Fiducial, radii: float) -> NDArray[np.bool_]:
-        image = np.zeros(registration.shape, np.uint8)
-        outline = registration.to_sensor(np.array([disc.x_mm, disc.y_mm]) + radii * disc.diameter_mm / 2.0 * circle)
-        cv2.fillPoly(image, [np.rint(outline).astype(np.int32)], 1)
-        return image.astype(bool)
-
-    discs = {name: disc for name, disc in registration.fiducials.items() if not disc.is_point and disc.marker is None}
-    pairs = {
-        name: (inside(disc, _CORE), inside(disc, _RING[1]) & ~inside(disc, _RING[0])) for name, disc in discs.items()
-    }
-    return {name: pair for name, pair in pairs.items() if all(mask.any() for mask in pair)}
+    return np.asarray(values - values @ over_discs @ np.linalg.pinv(over_discs))

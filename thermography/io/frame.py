@@ -257,29 +257,6 @@ class FrameReference(FrameHeader, ABC):
 
 
 @dataclass(frozen=True)
-class PlainFrame:
-    """A frame whose pixels stand in a file as they are; attributes as of `FrameReference`."""
-
-    path: Path
-    index: int
-    shape: tuple[int, int]
-    plain_samples: PlainSamples
-
-    def read_counts(self) -> NDArray[np.uint16]:
-        """Read the pixels, (row, column) uint16; raise an OSError where the file is shorter."""
-        kind = np.dtype("<u2" if self.plain_samples.little_endian else ">u2")
-        rows, columns = self.shape
-        counts = np.fromfile(self.path, kind, rows * columns, offset=self.plain_samples.offset)
-        if counts.size < rows * columns:
-            raise OSError(f"{self.path}: frame {self.index} ends early; the file was cut after it was indexed")
-        return counts.astype(np.uint16).reshape(self.shape)
-
-
-#: What reading pixels takes.
-StoredPixels = FrameReference | PlainFrame
-
-
-@dataclass(frozen=True)
 class RejectedFrame:
     """A frame or a file that was not used.
 

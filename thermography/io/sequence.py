@@ -37,7 +37,6 @@ from thermography.io.frame import (
     RejectedFrame,
     SampleLocation,
     Segments,
-    StoredPixels,
 )
 
 # Reads a window of the sensor from many frames.
@@ -57,7 +56,7 @@ class WindowReader:
         for file in self._open.values():
             file.close()
 
-    def read(self, frames: Sequence[StoredPixels], counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    def read(self, frames: Sequence[FrameReference], counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """Read the window of every frame into a buffer."""
         rows, columns = self.window
         counts = counts[: len(frames)]
@@ -79,7 +78,7 @@ class WindowReader:
                 target[...] = rows_read.reshape(-1, width)[:, columns]
         return counts
 
-    def read_in_chunks(self, frames: Sequence[StoredPixels], size: int) -> Iterator[NDArray[np.uint16]]:
+    def read_in_chunks(self, frames: Sequence[FrameReference], size: int) -> Iterator[NDArray[np.uint16]]:
         """Read the window of every frame, some frames at a time into one buffer."""
         buffer = np.empty((min(size, len(frames)), *(side.stop - side.start for side in self.window)), np.uint16)
         for start in range(0, len(frames), size):

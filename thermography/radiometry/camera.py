@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,7 +23,6 @@ from thermography.io.frame import FrameReference
 
 # Detects artefacts of the camera in a series of frames: repeated frames, frozen output, bad pixels and clipped counts.
 
-Cause = Literal["repeated_frame", "frozen_frames"]
 #: More repeats in a row than this mean that the camera output was frozen, not that a frame was written twice.
 _MAX_REPEATS = 2
 
@@ -39,28 +38,15 @@ _CLIPPED_MULTIPLE = 5
 _LEAST_NOISE_STEPS = 0.5
 
 
-@dataclass(frozen=True)
-class CameraFlag:
-    """A camera artefact, the first frame that shows it with its time, UTC, and a description without a full stop."""
-
-    cause: Cause
-    index: int
-    time: np.datetime64
-    message: str
-
-
-def find_repeats(repeated: NDArray[np.bool_], time: NDArray[np.datetime64]) -> list[CameraFlag]:
-    """Find frames that were written twice and intervals in which the camera output was frozen."""
-    flags = []
+def find_repeats(repeated: NDArray[np.bool_]) -> list[tuple[int, str]]:
+    """Find frames that were written twice and intervals in which the camera output was frozen: the first frame of each, and words."""
+    found = []
     labels, count = scipy.ndimage.label(repeated)
     for (run,) in scipy.ndimage.find_objects(labels)[:count]:
         length = run.stop - run.start
-        frozen = length > _MAX_REPEATS
         text = f"{length} {'frame repeats' if length == 1 else 'frames repeat'} the counts of frame {run.start - 1}"
-        text += ": the camera output was frozen" if frozen else ""
-        cause: Cause = "frozen_frames" if frozen else "repeated_frame"
-        flags.append(CameraFlag(cause, run.start, time[run.start], text))
-    return flags
+        found.append((run.start, text + (": the camera output was frozen" if length > _MAX_REPEATS else "")))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +195,8 @@ _OUTLYING = 4.0
 _MOST_STEPS = 0.4
 #: Fewest frames beyond the unknown values.
 _LEAST_FRAMES = 6
+#: Standard deviation of what walls hold from before the log, as a share of the range of the air: half of them lag, anywhere within it.
+_START_SHARE = 0.5 / 12.0**0.5
 #: Time constants with which thin and thick walls follow the air, s.
 ROOM_LAGS_S = (600.0, 3600.0)
 
@@ -216,7 +204,7 @@ ROOM_LAGS_S = (600.0, 3600.0)
 @dataclass(frozen=True, eq=False)
 class LevelSeries:
     """Levels of n frames: of the surroundings of the table and of the table, degC; temperatures inside the camera (n, k), K, and those that
-    the background follows, of the air and of it through lags (n, m), degC, where they were logged.
+    the background follows, of the air and of it through lags (n, m), degC, where they were logged, `logged_s` s before the first frame on.
     """
 
     seconds: Array
@@ -224,10 +212,11 @@ class LevelSeries:
     table: Array
     housing: Array
     room: Array
+    logged_s: float = 0.0
 
     def thinned(self, kept: NDArray[np.intp]) -> LevelSeries:
         """The series of some frames."""
-        return LevelSeries(**{name: values[kept] for name, values in vars(self).items()})
+        return replace(self, **{name: one[kept] for name, one in vars(self).items() if name != "logged_s"})
 
 
 @dataclass(frozen=True)
@@ -274,6 +263,14 @@ def estimate_correction(series: LevelSeries) -> CameraCorrection:
     shared = _shared_by_table(thin, places, sizes)
     of_housing = slice(room.shape[1], unknowns)
     of_room = slice(0, room.shape[1])
+    of_start = np.zeros((unknowns - room.shape[1],) * 2)
+    for lag_s in ROOM_LAGS_S if room.size else ():
+        # When the log begins, walls may differ from the air by what it does later; that decays as a housing warms.
+        decays = np.exp(-(thin.seconds - thin.seconds[0] + thin.logged_s) / lag_s) * np.ptp(thin.room[:, 0])
+        shown_as = fit.operator[of_housing] @ np.diff(decays)
+        of_start += np.outer(shown_as, shown_as) * _START_SHARE**2
+    covariance = fit.covariance.copy()
+    fit.covariance[of_housing, of_housing] += of_start
     drift_values, drift_covariance = fit.values[of_housing], fit.covariance[of_housing, of_housing]
     drifts = _significant(fit, of_room) and _significant(fit, of_housing)
     if drifts:
@@ -281,7 +278,7 @@ def estimate_correction(series: LevelSeries) -> CameraCorrection:
         # it. The truth lies between (R. Frisch, 1934; S. Klepper and E. E. Leamer, Econometrica 52 (1984) 163): a drift shows in both.
         reverse, drifts = _with_log_as_response(thin, housing, places)
         drift_values = (drift_values + reverse.values) / 2.0
-        drift_covariance = (drift_covariance + reverse.covariance) / 2.0
+        drift_covariance = (drift_covariance + reverse.covariance + of_start) / 2.0
         drifts &= np.ptp(housing @ drift_values) <= _LARGEST_DRIFT * np.ptp(np.nanmean(thin.housing, axis=1))
     # What camera and rest have added since the first frame, per unknown value.
     response = np.zeros((len(kept), len(fit.values)))
@@ -290,7 +287,6 @@ def estimate_correction(series: LevelSeries) -> CameraCorrection:
     of_camera = np.zeros(len(fit.values), bool)
     of_camera[of_housing] = True
     of_camera[unknowns:] = shared
-    covariance = fit.covariance.copy()
     if drifts:
         covariance[of_housing, of_housing] = drift_covariance
     variance = np.einsum("ij,jk,ik->i", response * of_camera, covariance, response * of_camera)
@@ -332,12 +328,13 @@ def hold_constant(level: Array) -> CameraCorrection:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Generalised least squares on the changes of the level; `shocks` (n - 1,) are the ratios of the changes to their standard deviation,
-    given all others, `limit` that from which one is a step.
+    """Generalised least squares on the changes of the level; `operator` (values, n - 1) gives the values of any changes, `shocks` (n - 1,)
+    are the ratios of the changes to their standard deviation, given all others, `limit` that from which one is a step.
     """
 
     values: Array
     covariance: Array
+    operator: Array
     shocks: Array
     freedom: int
     limit: float
@@ -426,7 +423,7 @@ def _fit(change: Array, regressors: Array, places: list[int], seconds: Array) ->
     precision = _diagonal_of_inverse(factor) - ((projected @ unit) * projected).sum(axis=1)
     shocks = (solved[:, 0] - projected @ values) / np.sqrt(np.maximum(precision, 1e-12) * scale)
     limit = float(-special.stdtrit(freedom, _SIGNIFICANCE / (2 * n)))
-    return _Fit(values, unit * scale, shocks, freedom, limit)
+    return _Fit(values, unit * scale, unit @ projected.T, shocks, freedom, limit)
 
 
 def _generalised(factor: Array, change: Array, design: Array) -> tuple[Array, Array, float, Array]:

@@ -170,7 +170,6 @@ def locate_disc(
         return "lies at the edge of the frame"
     to_mm = np.linalg.inv(jacobian)
     place = np.array([fiducial.x_mm, fiducial.y_mm])
-    reach = _RING * np.sqrt(np.diag(shape))
     # Centre (column, row), logarithms of the factor on the diameter and of the edge spread.
     state = np.array([*predicted_px, 0.0, np.log(optics.spread_px)], float)
     for step in range(_MOST_STEPS):
@@ -179,19 +178,9 @@ def locate_disc(
         # A place that is projected to infinity is no whole number.
         if not ((centre - own >= 0).all() and (centre + own <= np.array(temperature.shape[::-1]) - 1).all()):
             return "lies at the edge of the frame"
-        half = np.ceil(np.hypot(reach, 3 * spread + 1))
-        left, top = np.maximum(np.round(centre) - half, 0).astype(int)
-        right, bottom = np.minimum(np.round(centre) + half + 1, temperature.shape[::-1]).astype(int)
-        columns, rows = np.arange(left, right) - centre[0], np.arange(top, bottom) - centre[1]
-        offsets = np.stack(np.meshgrid(columns, rows), axis=-1)
-        dilated = np.linalg.inv(_RING**2 * shape + (3 * spread + 1) ** 2 * np.eye(2))
-        values = temperature[top:bottom, left:right]
-        seen = (np.einsum("...i,ij,...j", offsets, dilated, offsets) < 1) & np.isfinite(values)
-        # Beyond the table's edge, and as near to it as the blur reaches, a pixel shows more than table and disc.
-        plan_mm, row_mm = offsets @ to_mm.T + place, np.linalg.norm(to_mm, axis=1)
-        seen &= (
-            (plan_mm >= 3 * spread * row_mm) & (plan_mm <= (grid.width_mm, grid.height_mm) - 3 * spread * row_mm)
-        ).all(axis=-1)
+        window, columns, rows, seen = _surroundings(temperature.shape, centre, shape, spread, grid, (place, to_mm))
+        values = temperature[window]
+        seen &= np.isfinite(values)
         found = _fit_disc(values, columns, rows, seen, shape, state, optics)
         if isinstance(found, str):
             return found
@@ -219,6 +208,51 @@ def locate_disc(
         float(np.exp(state[3]) * fit.u[3]),
         *fit.slope_share,
     )
+
+
+def _surroundings(
+    frame: tuple[int, ...], centre: Array, shape: Array, spread: float, grid: PlanGrid, on_plan: tuple[Array, Array]
+) -> tuple[tuple[slice, slice], Array, Array, NDArray[np.bool_]]:
+    """Window of the frame around a disc at a place on the plan, mm, with the matrix from px to mm there: columns and rows from its centre,
+    and the pixels that show disc and table alone.
+    """
+    place, to_mm = on_plan
+    half = np.ceil(np.hypot(_RING * np.sqrt(np.diag(shape)), 3 * spread + 1))
+    left, top = np.maximum(np.round(centre) - half, 0).astype(int)
+    right, bottom = np.minimum(np.round(centre) + half + 1, frame[::-1]).astype(int)
+    columns, rows = np.arange(left, right) - centre[0], np.arange(top, bottom) - centre[1]
+    offsets = np.stack(np.meshgrid(columns, rows), axis=-1)
+    dilated = np.linalg.inv(_RING**2 * shape + (3 * spread + 1) ** 2 * np.eye(2))
+    seen = np.einsum("...i,ij,...j", offsets, dilated, offsets) < 1
+    # Beyond the table's edge, and as near to it as the blur reaches, a pixel shows more than table and disc.
+    plan_mm, row_mm = offsets @ to_mm.T + place, np.linalg.norm(to_mm, axis=1)
+    limits = 3 * spread * row_mm, (grid.width_mm, grid.height_mm) - 3 * spread * row_mm
+    seen &= ((plan_mm >= limits[0]) & (plan_mm <= limits[1])).all(axis=-1)
+    return (slice(top, bottom), slice(left, right)), columns, rows, seen
+
+
+def disc_weights(
+    frame: tuple[int, ...], fiducial: Fiducial, grid: PlanGrid, located: LocatedDisc, jacobian: Array, spread_px: float
+) -> tuple[tuple[slice, slice], Array] | None:
+    """Window of a frame around a located disc, and the weights (5, rows, columns) of its pixels in the level of the table at the centre, in
+    the contrast of the disc to it, both free of the blur, and in the products of the contrast with a displacement along columns and rows
+    and with a change of the logarithm of the edge spread; None where too few pixels show the table around it.
+    """
+    shape = (fiducial.diameter_mm / 2) ** 2 * jacobian @ jacobian.T
+    shape = shape * located.area_px / (np.pi * np.sqrt(np.linalg.det(shape)))
+    centre, on_plan = (
+        np.array([located.column_px, located.row_px]),
+        (np.array([fiducial.x_mm, fiducial.y_mm]), np.linalg.inv(jacobian)),
+    )
+    window, columns, rows, seen = _surroundings(frame, centre, shape, spread_px, grid, on_plan)
+    coverage, aside, along, _, by_spread = _blurred_ellipse(columns, rows, shape, spread_px)
+    if (seen & (coverage < 0.01)).sum() < 12:
+        return None
+    across, down = np.meshgrid(columns, rows)
+    basis = np.stack([np.ones_like(across), coverage, aside, along, by_spread, across, down], axis=-1)
+    weights = np.zeros((5, *seen.shape))
+    weights[:, seen] = np.linalg.pinv(basis[seen])[:5]
+    return window, weights
 
 
 class _DiscFit(NamedTuple):

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.registration import phase_cross_correlation
 
-from thermofuse.compiled import njit
 from thermography.common import Array
 from thermography.registration.discs import LocatedDisc
 from thermography.registration.plan import Fiducial, PlanGrid
@@ -33,6 +32,7 @@ from thermography.registration.projection import Projection, parameter_jacobian
 from thermography.registration.register import (
     Registration,
     RegistrationError,
+    fiducial_weights,
     locate_fiducials,
     picture_grid,
     register,
@@ -87,116 +87,48 @@ class RegistrationSpan:
 class FiducialMonitor:
     """Displacement of the fiducials in many frames at the cost of three weighted sums over the pixels around every disc.
 
-    Between the table around a disc (a plane through its ring) and the disc itself, the sum of the coverage and its first moments
-    are linear in the pixels; their ratio is the centroid. Raw counts serve as well as temperatures.
+    The least-squares contrast of a blurred disc to the plane around it, and contrast times displacement, are linear in the pixels; their
+    ratio is the displacement, as long as it is small against the disc's edge. Raw counts serve as well as temperatures.
 
     Attributes
     ----------
-    places : (discs, 5), top, left, height and width of every disc's patch in the window, and the index of its first weight
-    weights : (3, entries), for the sum and the first moments along columns and rows, patch after patch, row by row
-    noise_gain : (discs,), standard deviation of a disc's sum for pixels of unit noise
+    discs : window of every disc among the pixels, and their weights (pixels, 3), row by row, for the contrast and its products with the
+        displacement along columns and rows
+    noise_gain : (discs,), standard deviation of a disc's contrast for pixels of unit noise
     arms : (discs, 2) ndarray
         Place (column, row) of every disc from the middle of all registered fiducials, over their root mean square distance.
     """
 
-    places: NDArray[np.int64]
-    weights: NDArray[np.float32]
+    discs: list[tuple[tuple[slice, slice], NDArray[np.float32]]]
     noise_gain: Array
     arms: Array
 
     def displacements(self, counts: NDArray[np.uint16], noise_counts: float) -> Array:
         """Displacement of the fiducials in every frame: the shift by medians over the discs, growth and turn by their mean."""
-        least = _LEAST_SIGNIFICANCE * noise_counts * self.noise_gain
-        return _displacements(_disc_sums(counts, self.places, self.weights), least, self.arms)
+        sums = np.zeros((len(counts), len(self.discs), 3))
+        for disc, ((rows, columns), weights) in enumerate(self.discs):
+            pixels = counts[:, rows, columns].reshape(len(counts), -1).astype(np.float32)
+            # Relative to one pixel, so that single precision suffices; a constant has no effect on the sums.
+            sums[:, disc] = (pixels - pixels[:, :1]) @ weights
+        return _displacements(sums, _LEAST_SIGNIFICANCE * noise_counts * self.noise_gain, self.arms)
 
 
 def monitor_fiducials(registration: Registration, grid: PlanGrid, window: tuple[slice, slice]) -> FiducialMonitor:
     """Prepare the monitor for the fiducials of a registration that lie within a window of the sensor."""
-    places, weights, gains, arms, start = [], [np.empty((3, 0), np.float32)], [], [], 0
+    discs, arms = [], []
     middle, radius = (np.zeros(2), 1.0) if registration.is_picture else _middle(registration)
-    origin = np.array([window[1].start, window[0].start])
-    shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
-    for name, disc in registration.fiducials.items():
-        if disc.is_point:
-            continue
-        located = registration.located[name]
-        centre = np.array([located.column_px, located.row_px]) - origin
-        placed = _disc_weights(disc, centre, registration, grid, shape)
-        if placed is None:
-            continue
-        top, left, patch = placed
-        places.append((top, left, *patch.shape[1:], start))
-        weights.append(patch.reshape(3, -1).astype(np.float32))
-        gains.append(float(np.linalg.norm(patch[0])))
-        arms.append((centre + origin - middle) / radius)
-        start += patch[0].size
-    return FiducialMonitor(
-        np.array(places, np.int64).reshape(-1, 5),
-        np.concatenate(weights, axis=1),
-        np.array(gains),
-        np.array(arms).reshape(-1, 2),
-    )
-
-
-def _disc_weights(
-    disc: Fiducial, centre: Array, registration: Registration, grid: PlanGrid, shape: tuple[int, int]
-) -> tuple[int, int, Array] | None:
-    """Top, left and weights (3, height, width) of the patch around one disc; None where the window does not contain it."""
-    place = np.array([disc.x_mm, disc.y_mm])
-    jacobian = registration.projection.jacobian(place)
-    to_mm = np.linalg.inv(jacobian)
-    radius = disc.diameter_mm / 2
-    pixel_mm = float(np.linalg.norm(to_mm, 2))
-    half = np.ceil((1.5 * radius + 5.5 * pixel_mm) * np.linalg.norm(jacobian, axis=1)).astype(int)
-    low = np.maximum(np.round(centre).astype(int) - half, 0)
-    high = np.minimum(np.round(centre).astype(int) + half + 1, np.array(shape[::-1]))
-    columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
-    offsets = np.stack([columns - centre[0], rows - centre[1]], axis=-1).reshape(-1, 2)
-    plan = offsets @ to_mm.T + place
-    distance = np.linalg.norm(plan - place, axis=1)
-    counted = distance < radius + 3.5 * pixel_mm
-    ring = ~counted & (distance < 1.5 * radius + 5.5 * pixel_mm) & grid.contains(plan, margin_mm=1.5 * pixel_mm)
-    # Every other pixel of the ring determines its plane well enough, at half the cost.
-    ring &= ((columns + rows).ravel() & 1) == 0
-    if ring.sum() < 12 or counted.sum() < 12:
-        return None
-    basis = np.column_stack([offsets, np.ones(len(offsets))])
-    plane = np.linalg.solve(basis[ring].T @ basis[ring], basis[ring].T)
-    moments = np.column_stack([np.ones(len(offsets)), offsets])
-    weights = np.where(counted[:, None], moments, 0.0)
-    weights[ring] -= (moments[counted].T @ basis[counted] @ plane).T
-    return int(low[1]), int(low[0]), weights.T.reshape(3, *columns.shape)
-
-
-@njit(nogil=True)
-def _disc_sums(counts: Array, places: Array, weights: Array) -> Array:
-    """Sum and first moments of the coverage of every disc, (frames, discs, 3)."""
-    sums = np.zeros((len(counts), len(places), 3))
-    longest = 0
-    for disc in range(len(places)):
-        longest = max(longest, places[disc, 2] * places[disc, 3])
-    patch = np.empty(longest, np.float32)
-    for disc in range(len(places)):
-        top, left, height, width, start = places[disc]
-        size = height * width
-        for frame in range(len(counts)):
-            # Relative to one pixel of the patch, so that single precision suffices; a constant has no effect on the sums.
-            level = np.float32(counts[frame, top, left])
-            for i in range(height):
-                row = counts[frame, top + i, left : left + width]
-                for j in range(width):
-                    patch[i * width + j] = np.float32(row[j]) - level
-            for k in range(3):
-                sums[frame, disc, k] = _dot(patch[:size], weights[k, start : start + size])
-    return sums
-
-
-@njit(nogil=True, fastmath={"reassoc", "contract"})
-def _dot(a: Array, b: Array) -> np.float32:
-    total = np.float32(0)
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total
+    for name, ((rows, columns), patch) in fiducial_weights(registration, grid).items():
+        located, top, bottom = (
+            registration.located[name],
+            max(rows.start, window[0].start),
+            min(rows.stop, window[0].stop),
+        )
+        weights = patch[1:4, top - rows.start : bottom - rows.start].reshape(3, -1).T.astype(np.float32)
+        inside = (slice(top - window[0].start, bottom - window[0].start), columns)
+        discs.append((inside, weights))
+        arms.append((np.array([located.column_px, located.row_px]) - middle) / radius)
+    gains = np.array([np.linalg.norm(weights[:, 0]) for _, weights in discs])
+    return FiducialMonitor(discs, gains, np.array(arms).reshape(-1, 2))
 
 
 def _displacements(sums: Array, least: Array, arms: Array) -> Array:

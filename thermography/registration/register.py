@@ -20,6 +20,7 @@ from thermography.registration.discs import (
     DiscOptics,
     LocatedDisc,
     detect_discs,
+    disc_weights,
     identify_plan,
     locate_disc,
     pooled_optics,
@@ -824,6 +825,29 @@ def register(
     registration = max(found, key=lambda each: (len(each.located), -each.scatter_mm))
     markers = tuple(fiducial for fiducial in fiducials if fiducial.marker is not None)
     return replace(registration, masked=registration.masked + markers)
+
+
+def fiducial_weights(registration: Registration, grid: PlanGrid) -> dict[str, tuple[tuple[slice, slice], Array]]:
+    """Window and weights of `thermography.registration.discs.disc_weights` of every located disc that has pixels enough, by name."""
+    discs = {name: disc for name, disc in registration.fiducials.items() if not disc.is_point}
+    jacobians = registration.projection.jacobian(_geometry(list(discs.values()))[0].reshape(-1, 2))
+    spread_px, located = registration.optics.spread_px, registration.located
+    weights = {
+        name: disc_weights(registration.shape, disc, grid, located[name], jacobian, spread_px)
+        for (name, disc), jacobian in zip(discs.items(), jacobians, strict=True)
+    }
+    return {name: found for name, found in weights.items() if found is not None}
+
+
+def with_optics_of(temperature: Array, registration: Registration, grid: PlanGrid) -> Registration:
+    """The registration with the edge spread of another frame, (row, column) degC, where that is surely wider there."""
+    listed, before = list(registration.fiducials.values()), registration.optics
+    located, _ = locate_fiducials(temperature, listed, registration.projection, grid=grid, reach_px=_REACH_PX)
+    if 2 * len(located) < len(listed):
+        return registration
+    optics = pooled_optics(located.values())
+    wider = optics.spread_px - before.spread_px > 3.0 * np.hypot(optics.spread_u_px, before.spread_u_px)
+    return replace(registration, optics=optics) if wider else registration
 
 
 def judge(

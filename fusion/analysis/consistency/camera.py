@@ -421,8 +421,8 @@ _PICTURE_K = 0.1
 #: Share of the mean rise that an unknown zero may be: beyond it a coefficient per kelvin is known to no better than half of its value,
 #: and the propagation of its uncertainty to first order ends.
 _ZERO_SHARE = 0.33
-#: Share of the table's warming by which discs may differ on top: the blur of the lens mixes some of the table into small discs.
-_RIM_SHARE = 0.03
+#: Share of the table's warming by which discs may differ on top: what the blur mixes of the table into a disc is known to some per cent.
+_RIM_SHARE = 0.01
 
 
 @check("fields", CAMERA)

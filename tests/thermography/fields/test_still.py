@@ -326,7 +326,7 @@ def rms_K(fields) -> float:
 def test_a_knock_of_any_size_is_followed(tmp_path, rng, shift_px):
     fields = reduced(tmp_path, rng, [STILL] * 3 + [replace(SCENE, shift_px=shift_px).render()] * 3)
     (knock,) = json.loads(fields.attrs["knocks"])
-    assert knock["index"] == 3
+    assert (knock["index"], knock["crept"]) == (3, False)
     assert knock["shift_px"] == pytest.approx(shift_px, abs=0.05)
     assert knock["zoom"] == pytest.approx(1.0, abs=3e-4)
     # 50 mK of noise and 17 pixels per cell.
@@ -334,6 +334,12 @@ def test_a_knock_of_any_size_is_followed(tmp_path, rng, shift_px):
     assert np.nanmax(fields["frame_shift"].values) < 0.2
     for remark in ("unchecked_stretches", "frames_shaken", "frames_unchecked"):
         assert json.loads(fields.attrs[remark]) == []
+
+
+def test_a_camera_that_creeps_is_no_knock(tmp_path, rng):
+    fields = reduced(tmp_path, rng, [replace(SCENE, shift_px=(0.15 * k, 0.0)).render() for k in range(5)])
+    (creep,) = json.loads(fields.attrs["knocks"])
+    assert (creep["index"], creep["crept"]) == (4, True)
 
 
 def test_a_zoom_is_followed(tmp_path, rng):

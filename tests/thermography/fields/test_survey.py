@@ -3,16 +3,19 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import without_checksums
 from tests.thermography.plan_scene import GRID, SC660, START, Scene, registered, smooth_field
-from thermography.fields.survey import compare_discs, disturbed_frames, locate_blocks, stray_frames, survey_frames
+from thermography.fields.survey import disturbed_frames, locate_blocks, read_discs, stray_frames, survey_frames
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CalibratedRange, Frame
+from thermography.radiometry.camera import Detector
 from thermography.radiometry.planck import counts_from_temperature
+from thermography.registration.register import with_optics_of
 
 pytestmark = pytest.mark.long
 
@@ -43,6 +46,12 @@ def _film(path: Path, image: np.ndarray, rng: np.random.Generator, change=lambda
 
 def _disturbed(survey, registration) -> dict[int, str]:
     return disturbed_frames(survey, locate_blocks(survey, registration, GRID, np.zeros((0, 2))), still=True)
+
+
+def _compared(frames, registration):
+    levels = read_discs(frames, registration, GRID, Detector.sound(registration.shape))
+    assert levels.blurred is None
+    return levels.compared(np.zeros(len(frames), bool))
 
 
 def test_levels_and_blocks(tmp_path, image, registration, rng):
@@ -194,13 +203,25 @@ def test_discs_show_what_the_camera_adds_to_a_table_that_warms(tmp_path, rng):
             return image + passed * (warming * (1.0 - 0.85 * mask) + added)
 
         name = f"{np.ptp(added):.1f}_{np.max(added):.1f}.seq"
-        return compare_discs(_film(tmp_path / name, Scene(disc_K=-4.0).render(), rng, change), registered())
+        return _compared(_film(tmp_path / name, Scene(disc_K=-4.0).render(), rng, change), registered())
 
     sound, creeps, narcissus = shown(0.0 * spot), shown(0.0 * spot + 1.0), shown(0.6 * spot)
     # A dozen pixels of 50 mK per disc.
     assert np.abs(sound.common_K).max() < 0.05 and np.ptp(sound.pattern_K, axis=0).max() < 0.1
     assert creeps.common_K[-1] == pytest.approx(1.0, abs=0.06) and np.ptp(creeps.pattern_K, axis=0).max() < 0.1
     assert np.ptp(narcissus.pattern_K, axis=0).max() > 0.2
+
+
+def test_a_picture_that_blurs_is_told_and_its_spread_measured(tmp_path, rng):
+    sharp, registration = Scene(disc_K=-4.0).render(), registered()
+    blurred = cv2.GaussianBlur(sharp, (0, 0), 2.0)
+    frames = _film(tmp_path / "a.seq", sharp, rng, lambda index, image: image if index < 3 else blurred)
+    levels = read_discs(frames, registration, GRID, Detector.sound(registration.shape))
+    first, widest = levels.blurred
+    # Means over five frames.
+    assert abs(first - 3) <= 2 and widest >= 3
+    assert with_optics_of(sharp, registration, GRID) is registration
+    assert with_optics_of(blurred, registration, GRID).optics.spread_px == pytest.approx(2.0, abs=0.15)
 
 
 def test_another_range_with_its_own_parameters_is_no_change_of_the_zero(tmp_path, rng):
@@ -221,6 +242,6 @@ def test_another_range_with_its_own_parameters_is_no_change_of_the_zero(tmp_path
             frame = replace(frame, counts=counts, parameters=replace(of, planck_r1=0.5 * of.planck_r1))
         write_sequence(tmp_path / f"{number}.seq", [frame])
         switched += index_frames([tmp_path / f"{number}.seq"])[0]
-    shown = compare_discs(switched, registered())
+    shown = _compared(switched, registered())
     # A dozen pixels of 50 mK per disc; taken for the first range the counts of the second are some 36 K less.
     assert np.abs(shown.common_K).max() < 0.06 and 1.5 < shown.warming_K < 2.1

@@ -12,6 +12,7 @@ from thermography.fields.resampling import plan_window
 from thermography.fields.still import reduce_frames
 from thermography.radiometry.planck import counts_from_temperature
 from thermography.registration.displacement import (
+    SUSPECT_PX,
     fiducial_displacement,
     image_displacement,
     monitor_fiducials,
@@ -71,10 +72,12 @@ def test_knock_while_the_discs_have_no_contrast_is_found_and_mended(rng, registr
 
 
 def test_monitor_and_located_fiducials_show_the_shift_of_each_frame(rng, registration):
-    shifts = [(0.0, 0.0), (0.4, -0.3), (-0.7, 0.2)]
+    shifts = [(0.0, 0.0), (0.2, -0.1), (-0.7, 0.2)]
     frames = np.stack([replace(Scene(disc_K=-4.0), shift_px=shift).render(rng) for shift in shifts])
-    # The monitor is linear for shifts well below its margin of some pixels.
-    np.testing.assert_allclose(monitored(frames, registration)[:, :2], shifts, atol=0.05)
+    shown = monitored(frames, registration)[:, :2]
+    # The monitor is linear for shifts well below the width of an edge; what may be a knock shows beyond the limit for a closer look.
+    np.testing.assert_allclose(shown[:2], shifts[:2], atol=0.02)
+    assert np.linalg.norm(shown[2]) > SUSPECT_PX
     for frame, shift in zip(frames, shifts, strict=True):
         np.testing.assert_allclose(fiducial_displacement(frame, registration, GRID), [*shift, 0.0, 0.0], atol=0.02)
 

@@ -92,7 +92,10 @@ def hot(frame: FrameReference) -> FrameReference:
             lambda frame: with_parameters(frame, emissivity=0.7),
             3,
             set(),
-            {"camera_settings": "Parameters differ between the frames: emissivity."},
+            {
+                "camera_settings": "Parameters differ between the frames: emissivity (0.7 to 0.97). "
+                "The emissivity of the first frame is used for all."
+            },
         ),
         (lambda frame: with_parameters(frame, emissivity=0.7), 3, STATED, {}),
         (hot, 3, STATED, {"camera_settings": "The camera's range changes (2 ranges)."}),
