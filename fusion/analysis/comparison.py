@@ -13,7 +13,17 @@ import xarray as xr
 from scipy import special
 
 from fusion.analysis.attribution.places import ComparisonError, PlaceComparison, compare_places
-from fusion.analysis.drift_model.verification import EXPLAINS, LESS_PROBABLE, NAMED_GAINS, NAMED_U, SCALE_U, name_faults
+from fusion.analysis.drift_model.recursion import columns_of, record_of_product
+from fusion.analysis.drift_model.verification import (
+    EXPLAINS,
+    LESS_PROBABLE,
+    NAMED_GAINS,
+    NAMED_U,
+    SCALE_U,
+    name_faults,
+    response_gains,
+    whole_response,
+)
 from fusion.analysis.levels import CHANGE_LEVEL
 from fusion.analysis.predicted_test import APPROACHES, predict_values, scatter_and_drift
 from fusion.common import Array
@@ -471,6 +481,7 @@ class ComparedCampaign:
     axis : name of the measured axis; empty where the run does not tell
     drift : joint estimate with ``position`` (target; mm); None where there are no readings with times
     maps : which part of the field the drift follows, as `tf.correlate` returns it; None where that was not tested
+    record : the record as ``fusion.nc`` holds it, without its events; None of a test along an axis
     """
 
     results: Results
@@ -478,6 +489,7 @@ class ComparedCampaign:
     axis: str
     drift: xr.Dataset | None
     maps: xr.DataTree | None = None
+    record: xr.Dataset | None = None
 
     @property
     def name(self) -> str:
@@ -499,7 +511,8 @@ class Change:
 
     Attributes
     ----------
-    group : {"profile", "scatter", "drift per kelvin", "ISO 230-2"}; what it belongs to
+    group : {"profile", "scatter", "drift per kelvin", "ISO 230-2", "response", "level", "noise"}; what it belongs to, the last three of a
+        displacement of a record
     before, after : in both campaigns; None for a change of shape, which has no value of its own
     change : after minus before; of a scatter the ratio, without unit
     p_value : two-sided, family-wise over the tests of `family`
@@ -524,6 +537,12 @@ class Change:
     def significant(self) -> bool:
         """Whether it differs by more than the uncertainties allow."""
         return self.p_value <= CHANGE_LEVEL
+
+    @property
+    def shown_from(self) -> float | None:
+        """Size from which on a change is significant in 95 of 100 such comparisons; None without an uncertainty."""
+        limit = special.ndtri(0.95) - special.ndtri(0.5 * CHANGE_LEVEL / self.family)
+        return None if self.change.u is None else float(limit) * self.change.u
 
 
 @dataclass(frozen=True)
@@ -684,6 +703,13 @@ def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, s
     differ = [Lack("axis", (stated.name, stated.axis, silent.name))] if before.axis != after.axis else []
     if differ and silent.axis:
         return PairComparison(before, after, (), None, (Lack("axes", (before.axis, after.axis)),), 0)
+    if before.record is not None or after.record is not None:
+        found = [*_records(before, after)]
+        compared = _of_type(Change, found)
+        tests = pairs * sum(one.change.u is not None for one in compared)
+        return PairComparison(
+            before, after, tuple(_in_family(compared, tests)), None, tuple(_of_type(Lack, found)), tests
+        )
     common = common_inputs(before, after, same_setup=same_setup)
     others = [*_scatters(before, after), *_coefficients(before, after)]
     standard = [*_standard(before, after, common)]
@@ -779,6 +805,64 @@ def _coefficients(before: ComparedCampaign, after: ComparedCampaign) -> Iterator
         if name in found[1] and found[0][name].unit == found[1][name].unit:
             before_and_after = (Quantity(value=model[name].value, u=model[name].u) for model in found)
             yield _difference(name, "drift per kelvin", found[0][name].unit, *before_and_after, machine=True)
+
+
+#: A response that is known no better than to this share of it is not compared.
+_LEAST_KNOWN = 0.5
+
+
+def _records(before: ComparedCampaign, after: ComparedCampaign) -> Iterator[Change | Lack]:
+    """Response, level and noise of every displacement that two records have, or what cannot be compared.
+
+    How much a displacement answers its readings is learnt from either record and asked of the other: what is wrong in either makes the gain
+    smaller, and cancels in the mean of the logarithms. Levels are compared at equal temperatures, beyond what wanders in between.
+    """
+    products = [one.record for one in (before, after) if one.record is not None]
+    if len(products) < 2 or any("run" in one for one in products):
+        yield Lack("kinds")
+        return
+    units = [{name: "" for kind in ("channel", "sensor") for name in one[kind].values} for one in products]
+    for one, of in zip(units, products, strict=True):
+        one.update(zip(of["driver_name"].values, of["driver_units"].values, strict=True))
+    common = {
+        kind: [name for name in products[0][kind].values if units[0][name] == units[1].get(name)]
+        for kind in ("channel", "sensor", "driver_name")
+    }
+    if alone := sorted((units[0].keys() | units[1].keys()) - {name for names in common.values() for name in names}):
+        yield Lack("columns", (", ".join(alone),))
+    if not common["channel"] or not common["sensor"]:
+        yield Lack("nothing_common")
+        return
+    first, second = (record_of_product(one.sel(common)) for one in products)
+    learnt, again = whole_response(first), whole_response(second)
+    forth, back = response_gains(first, learnt, second, again), response_gains(second, again, first, learnt)
+    warmer = dict(zip(first.sensors, second.temperature[0] - first.temperature[0], strict=True))
+    moved = np.array([warmer.get(one.input, 0.0) for one in columns_of(first, first.sensors)])
+    between_s = abs(float((second.start - first.start) / np.timedelta64(1, "s")))
+    for k, (name, *both) in enumerate(zip(first.channels, learnt, again, strict=True)):
+        if any(u > _LEAST_KNOWN * gain for gain, u, _ in (forth[k], back[k])):
+            yield Lack("response", (name,))
+            continue
+        (gain, gain_u, freedom), (inverse, inverse_u, fewest) = forth[k], back[k]
+        freedom = min(freedom, fewest)
+        share, u = math.sqrt(gain / inverse), math.hypot(gain_u / gain, inverse_u / inverse)
+        p = float(2.0 * special.stdtr(freedom, -abs(math.log(share)) / u))
+        # As wide as so few parts make its interval.
+        percent_u = 100.0 * share * u * float(special.stdtrit(freedom, 0.975) / special.ndtri(0.975))
+        whole, change = Quantity(value=100.0, u=None), Quantity(value=100.0 * (share - 1.0), u=percent_u)
+        yield Change(
+            name, "response", None, "%", whole, Quantity(value=100.0 * share, u=percent_u), change, p, machine=True
+        )
+        was, now = (each.displacement[np.isfinite(each.displacement[:, k]), k][0] for each in (first, second))
+        expected = [float(was + moved @ one.coefficients) for one in both]
+        open_um2 = sum(one.noise_um**2 * (1.0 + one.ratio * between_s) + moved @ one.covariance @ moved for one in both)
+        u = math.sqrt(open_um2 + (expected[1] - expected[0]) ** 2 / 4.0)
+        level = Quantity(value=sum(expected) / 2.0, u=u), Quantity(value=float(now), u=None)
+        change = Quantity(value=float(now) - sum(expected) / 2.0, u=u)
+        p = float(2.0 * special.ndtr(-abs(float(now) - sum(expected) / 2.0) / u))
+        yield Change(name, "level", None, "um", *level, change, p, machine=True)
+        noises = (Quantity(value=one.noise_um, u=None) for one in both)
+        yield _difference(name, "noise", "um", *noises, machine=False)
 
 
 def _per_kelvin(loop: AxisLoop) -> dict[str, Coefficient]:

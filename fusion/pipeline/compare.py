@@ -15,6 +15,7 @@ from fusion.analysis.comparison import (
     compare_tests,
     compare_with_table,
 )
+from fusion.analysis.drift_model.recursion import events_of
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.messages import naming
 from fusion.report.comparison import (
@@ -78,7 +79,11 @@ def read_campaign(folder: Path) -> ComparedCampaign:
     results = read_results(folder)
     maps = None if results.correlation is None else read_fusion(folder).children.get("correlation")
     drift = _drift(folder)
-    return ComparedCampaign(results, file_sha256(folder / "results.json"), _axis(folder), drift, maps)
+    record = None
+    if isinstance(results.loop, RecordLoop):
+        record = read_product(folder, "record")
+        record = record.assign(displacement=record["displacement"] - events_of(record, results.loop).sum(axis=0))
+    return ComparedCampaign(results, file_sha256(folder / "results.json"), _axis(folder), drift, maps, record)
 
 
 def _axis(folder: Path) -> str:
@@ -139,20 +144,19 @@ def compare_runs(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
 
 def _compare_records(pair: PairComparison, out: Path) -> list[tuple[str, str]]:
     """Compare the effects that the loops of two records named."""
-    results = [pair.before.results, pair.after.results]
-    loops = [(one.campaign, one.loop) for one in results if isinstance(one.loop, RecordLoop)]
-    named = [(step.effect, k) for k, (_, loop) in enumerate(loops) for step in loop.named]
-    shown_by = {effect: sorted({k for other, k in named if other == effect}) for effect, _ in named}
-    rows, records = [], []
-    for title, loop in loops:
-        records.append({"title": title, **{key: getattr(loop, key) for key in _FIGURES}})
+    tests = [one.results for one in (pair.before, pair.after)]
+    loops = {k: (one.campaign, one.loop) for k, one in enumerate(tests) if isinstance(one.loop, RecordLoop)}
+    named = [{step.effect: None for step in loop.named} for _, loop in loops.values()]
+    shown_by = {name: [k for k, one in enumerate(named) if name in one] for one in named for name in one}
+    figures = [{"title": title, **{key: getattr(loop, key) for key in _FIGURES}} for title, loop in loops.values()]
+    agreement = [{"effect": name, "shown_by": who, "agrees": len(who) == 2} for name, who in shown_by.items()]
+    titles = [one.campaign for one in tests]
+    write_json(out / "joint.json", {"campaigns": titles, "records": figures, "agreement": agreement})
+    rows = []
+    for title, loop in loops.values():
         errors = f"{number(loop.rmse_declared_um, 3)} -> {number(loop.rmse_final_um, 3)} µm"
         rows.append((title, f"{say('verdict_word', loop)}, held-out error {errors}"))
-    agreement = [{"effect": name, "shown_by": who, "agrees": len(who) == 2} for name, who in shown_by.items()]
-    write_json(
-        out / "joint.json", {"campaigns": [title for title, _ in loops], "records": records, "agreement": agreement}
-    )
     for name, who in shown_by.items():
-        confirmed_by = "both records" if len(who) == 2 else f"{loops[who[0]][0]} alone"
+        confirmed_by = "both records" if len(who) == 2 else f"{titles[who[0]]} alone"
         rows.append((effect_words(name).name, f"confirmed by {confirmed_by}"))
-    return rows
+    return [*rows, ("changes", conclude_comparison(pair)), *(("not compared", lack) for lack in lacks_in_words(pair))]

@@ -83,7 +83,12 @@ def conclude_comparison(pair: PairComparison) -> str:
         ]
         for machine in (True, False)
     )
-    text = say("comparison_outcome", bool(pair.changes), machine, state, pair.table)
+    shown = [
+        f"{change_name(change)} by {fixed(change.shown_from, 2)} {print_unit(change.unit)}"
+        for change in pair.changes
+        if pair.before.record is not None and change.shown_from is not None and not change.significant
+    ]
+    text = say("comparison_outcome", bool(pair.changes), machine, state, pair.table, shown)
     for campaign in (pair.before, pair.after) if pair.changes else ():
         text = conditional(text, campaign.results.inputs, "positions")
     return text
@@ -120,7 +125,7 @@ def comparison_notes(pairs: Sequence[PairComparison]) -> list[str]:
     """Return what holds for all comparisons with the reference: level, what was presumed, common errors, and what cannot be compared."""
     tests = max(pair.tests for pair in pairs)
     standard = max((one.family for pair in pairs for one in pair.changes if one.group == "ISO 230-2"), default=0)
-    notes = sentences("comparison_level", CHANGE_LEVEL, tests, standard)
+    notes = sentences("comparison_level", CHANGE_LEVEL, tests, standard, pairs[0].before.record is not None)
     names = _letters(pairs)[1:]
     common = [(pair.common, name) for pair, name in zip(pairs, names, strict=True) if pair.common]
     lacks = [(lack, name) for pair, name in zip(pairs, names, strict=True) for lack in lacks_in_words(pair)]
@@ -411,7 +416,7 @@ def render_comparison(pairs: Sequence[PairComparison], *, reports: Sequence[str]
     return render_page(
         "comparison.html.j2",
         embed({name: chart for name, chart in charts.items() if chart is not None}),
-        sheet=describe_pair(pairs[0]) if len(pairs) == 1 else None,
+        sheet=describe_pair(pairs[0]) if len(pairs) == 1 and pairs[0].before.record is None else None,
         names=campaign_names(pairs),
         compared=_shared([(conclude_comparison(pair), name) for name, pair in zip(names[1:], pairs, strict=True)]),
         table_said=conclude_table(pairs[0]),

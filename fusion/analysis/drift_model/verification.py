@@ -8,7 +8,7 @@ it is about as probable are named with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -191,6 +191,35 @@ def _readings(after: Record, model: Recursion, faulty: Mapping[str, str]) -> Arr
         else:
             columns.append(np.full(after.seconds.size, one.reference))
     return np.column_stack(columns)
+
+
+def whole_response(record: Record) -> list[Response]:
+    """Return the response of every displacement of a record to all its readings."""
+    values = evaluate_columns(record, columns_of(record, record.sensors))
+    blocks = record.displacement.shape
+    return respond(record, values, np.zeros((0, *blocks)), np.ones(blocks[0], bool))
+
+
+def response_gains(
+    learnt: Record, responses: Sequence[Response], asked: Record, own: Sequence[Response]
+) -> list[tuple[float, float, int]]:
+    """Gain with which every displacement of a record answers its readings, its standard uncertainty and degrees of freedom.
+
+    1 is the answer learnt from another record with the same columns; uncertain by what that leaves open and, by jackknife, as parts differ.
+    """
+    there = evaluate_columns(_with_readings(asked, learnt), columns_of(learnt, learnt.sensors))
+    parts, found = np.unique(asked.chained), []
+    for course, one, other in zip(asked.displacement.T, responses, own, strict=True):
+        # Noise and wandering are those of the record that is asked.
+        response, predicted = replace(one, noise_um=other.noise_um, ratio=other.ratio), there @ one.coefficients
+        known = np.isfinite(course)
+        gains = [
+            _Second(asked.seconds[rows], course[rows], predicted[rows], there[rows], response, {}).gain()
+            for rows in (known, *(known & (asked.chained != part) for part in parts))
+        ]
+        u = float(np.hypot(gains[0][1], np.sqrt(parts.size - 1) * np.std([gain for gain, _ in gains[1:]])))
+        found.append((1.0 + gains[0][0], u, parts.size - 1))
+    return found
 
 
 @dataclass(frozen=True)

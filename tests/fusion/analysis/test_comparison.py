@@ -25,7 +25,7 @@ from fusion.common import Array
 from fusion.pipeline.compare import compare_campaigns
 from fusion.results.parts import PREDICTION_ENDING, ByDirection, Quantity, TablePrediction
 from fusion.results.results import ResultsError
-from fusion.results.store import file_sha256
+from fusion.results.store import file_sha256, write_dataset
 from interferometry.iso230 import evaluate_iso230
 from tests.fusion.compared_tests import REPAIRED_MM, drift_of, readings_of, repaired, write_results
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
@@ -102,10 +102,16 @@ def test_another_axis_and_a_record_say_why_nothing_is_compared(before: Path, tmp
     other = write_results(tmp_path / "y", readings_of(32), axis="Y")
     record = write_results(tmp_path / "record", readings_of(32), loop=RECORD_LOOP, iso230=None)
     (record / "deviations.nc").unlink()
+    blocks = {
+        name: (("time", of), np.zeros((2, 1))) for name, of in (("displacement", "channel"), ("temperature", "sensor"))
+    }
+    contributed = ("effect", "time", "channel"), np.zeros((1 + len(RECORD_LOOP["steps"]), 2, 1))
+    written = xr.Dataset({**blocks, "predicted_u": ("channel", np.zeros(1)), "contribution": contributed})
+    write_dataset(record / "fusion.nc", written)
     along_y, recorded = compare_campaigns([before, other, record])
     assert along_y.changes == ()
     assert along_y.not_compared == (Lack("axes", ("X", "Y")),)
-    assert [lack.code for lack in recorded.not_compared] == ["model", "readings", "drift"]
+    assert [lack.code for lack in recorded.not_compared] == ["kinds"]
 
 
 @pytest.mark.parametrize("axes", [("", "X"), ("X", "")])

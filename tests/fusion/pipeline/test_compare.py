@@ -81,12 +81,12 @@ def test_products_that_no_run_wrote_are_refused(folders, tmp_path, name):
     assert not (tmp_path / "joint.json").exists()
 
 
-def write_record(folder: Path, title: str) -> Path:
+def write_record(folder: Path, title: str, *, seed: int = 5, per_kelvin: float = 2.0, level: float = 0.0) -> Path:
     """A channel that follows one sensor, an hour long."""
-    rng = np.random.default_rng(5)
-    temperature = 20.0 + np.cumsum(rng.normal(0.0, 0.1, 60))
-    noise = rng.normal(0.0, 0.05, 60)
-    rows = [f"{60 * k},{t:.3f},{2.0 * t + noise[k]:.3f}" for k, t in enumerate(temperature)]
+    rng = np.random.default_rng(seed)
+    temperature = 20.0 + np.cumsum(rng.normal(0.0, 0.3, 60))
+    moved = level + per_kelvin * (temperature - 20.0) + rng.normal(0.0, 0.05, 60)
+    rows = [f"{60 * k},{t:.3f},{um:.3f}" for k, (t, um) in enumerate(zip(temperature, moved, strict=True))]
     return record_of_rows(folder, *rows, name=title)
 
 
@@ -102,7 +102,28 @@ def test_two_records_are_told_together(tmp_path):
     assert document["campaigns"] == [name for name, _ in rows[:2]] == ["Monday", "Tuesday"]
     assert document["records"][0]["rmse_final_um"] == document["records"][1]["rmse_final_um"]
     assert all(one["agrees"] for one in document["agreement"])
-    assert "held-out error" in rows[0][1]
+    assert "held-out error" in rows[0][1] and rows[-1][0] == "changes"
+
+
+@pytest.mark.chain
+def test_of_two_records_response_and_level_are_compared(tmp_path):
+    paths = [
+        write_record(tmp_path, "Monday"),
+        write_record(tmp_path, "Tuesday", seed=6),
+        write_record(tmp_path, "Friday", seed=7, per_kelvin=3.0, level=40.0),
+    ]
+    folders = [tmp_path / "results" / path.stem for path in paths]
+    for path, folder in zip(paths, folders, strict=True):
+        run_campaign(path, folder)
+    alike, other = ({one.group: one for one in pair.changes} for pair in compare_campaigns(folders))
+    assert alike.keys() == other.keys() == {"response", "level", "noise"}
+    assert not any(one.significant for one in alike.values())
+    assert all(other[name].significant for name in ("response", "level"))
+    assert other["response"].change.value == pytest.approx(50.0, abs=2.0 * other["response"].change.u)
+    assert other["level"].change.value == pytest.approx(40.0, abs=2.0 * other["level"].change.u)
+    # The noise has no uncertainty: it is shown and not judged. What would have been seen is more than the uncertainty.
+    assert alike["noise"].shown_from is None and not other["noise"].significant
+    assert alike["response"].shown_from > 2.0 * alike["response"].change.u
 
 
 def test_a_record_beside_both_instruments_is_refused(tmp_path, monkeypatch):
