@@ -399,6 +399,8 @@ def _tiff_pages(path: Path, size: int, changed_ns: int) -> tuple[list[int], np.d
     with _refused(f"{path}: damaged TIFF", "export it again"), tifffile.TiffFile(path) as file:
         pages: list[Any] = list(file.pages)
         looks = [(page.shape, page.dtype, page.photometric, page.is_reduced) for page in pages]
+        if not looks or not all(isinstance(side, int) for shape, *_ in looks for side in shape):
+            raise ValueError("no page, or one without a size")
         stamps = [str(page.tags["DateTime"].value) if "DateTime" in page.tags else "" for page in pages]
         # Programs for microscopes state many frames and write one page.
         stated = prod(file.series[0].shape[:-2]) if len(pages) == 1 and len(looks[0][0]) == 2 else 1

@@ -120,6 +120,14 @@ def test_a_tiff_whose_strips_do_not_fill_its_page_is_refused_before_memory_is_ta
         TiffReader().read_values(path, 0, EVERY_10_S)
 
 
+def test_a_tiff_whose_first_page_lies_beyond_its_end_is_refused(tmp_path):
+    (tmp_path / "a.tif").write_bytes(b"II*\0" + (64).to_bytes(4, "little"))
+    with pytest.raises(
+        ThermographyError, match=r"a\.tif: damaged TIFF \(no page, or one without a size\); export it again"
+    ):
+        TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
+
+
 @pytest.mark.parametrize("kind", ["complex64", "bool"])
 def test_values_that_are_no_real_numbers_are_named_by_their_type(tmp_path, kind):
     tifffile.imwrite(tmp_path / "a.tif", STACK[0].astype(kind), photometric="minisblack")
