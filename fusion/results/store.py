@@ -222,10 +222,10 @@ def read_tree(path: Path) -> xr.DataTree:
     """Read a tree written by `write_dataset` into memory."""
     import xarray as xr
 
+    # `DataTree.load` leaves a variable in the file that is called like a group: it would open it again, and never close it.
     with refuse_damaged(path), xr.open_datatree(path, **_READING) as tree:
-        read = tree.load()
-        read.dataset = _as_called(read.to_dataset(inherit=False))
-        return read
+        groups = {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
+    return xr.DataTree.from_dict({**groups, "/": _as_called(groups["/"])})
 
 
 @contextmanager

@@ -28,6 +28,7 @@ from fusion.results.store import (
     finished_stages,
     group,
     has,
+    in_groups,
     is_large,
     joined,
     noted_messages,
@@ -192,6 +193,19 @@ def test_large_arrays_are_written_in_pieces_and_stay_in_the_file(
     xr.testing.assert_identical(read_dataset(path), whole)
     assert opened["rise"].encoding["chunksizes"] == (11, 10, 20)
     opened.close()
+
+
+def test_nothing_of_a_tree_that_was_read_is_left_in_its_file(tmp_path: Path) -> None:
+    """A file that is opened again for a variable stays open, and the library of HDF5 ends the process at the next look at it."""
+    courses = {"rise": ("cycle", np.arange(3.0)), "comparison_chart": ("cycle", ["a", "b", "c"])}
+    dataset = xr.Dataset({**courses, "chart_chart": ("cycle", np.ones(3)), "chart_limit": ((), 1.0)})
+    tree = read_tree(write_dataset(tmp_path / "deviations.nc", in_groups(dataset)))
+    for node in tree.subtree:
+        for name, variable in node.to_dataset().variables.items():
+            assert variable._in_memory, (node.path, name)
+    xr.testing.assert_identical(
+        joined(tree.to_dataset(), **{name: one.to_dataset() for name, one in tree.children.items()}), dataset
+    )
 
 
 def test_a_small_dataset_is_opened_into_memory(tmp_path: Path) -> None:
