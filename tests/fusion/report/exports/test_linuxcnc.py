@@ -137,7 +137,8 @@ def test_a_model_beside_a_table_goes_on_after_a_restart_and_rests_when_a_sensor_
             print(f"{due:11.3f} {correction:17.3f} {1e3 * offset:13.3f} {at:15.5f} {motor:12.5f} {status:8.0f}")
     # Half a second in the order of reading and step is 0.33 um of 40 um in a minute.
     np.testing.assert_allclose(log[:, 0], known, atol=0.33)
-    np.testing.assert_allclose(1e3 * log[:, 1], log[:, 0], atol=COUNT_UM)
-    np.testing.assert_allclose(1e3 * np.ptp(log[:, 3] - log[:, 2]), 0.0, atol=0.2)
+    # The pins are read one after the other while the axis goes on: a second of it is 0.67 um.
+    np.testing.assert_allclose(1e3 * log[:, 1], log[:, 0], atol=0.67 + COUNT_UM)
+    np.testing.assert_allclose(1e3 * np.ptp(log[:, 3] - log[:, 2]), 0.0, atol=0.67 + COUNT_UM)
     assert log[:, 4].tolist() == [0.0] * 5 + [2.0]
     assert known[4] < known[2] < -3.0 and known[-1] == 0.0
