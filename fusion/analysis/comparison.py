@@ -677,12 +677,11 @@ def predict_here(
         return {}
     shapes = _state_shapes(difference, (before, after))
     wide = difference.beside(shapes)
-    sizes, _ = wide.fit(shapes)
     design = np.column_stack([shape.column for shape in shapes])
     fitted = design @ np.linalg.pinv(np.linalg.solve(wide.root, design)) @ np.linalg.inv(wide.root)
     kept, (of_first, of_second, *of_shapes) = np.eye(len(fitted)) - fitted, wide.covariances
     covariance = kept @ np.sum([of_first, *of_shapes], axis=0) @ kept.T + fitted @ of_second @ fitted.T
-    left = before["profile"].values + (design @ sizes).reshape(before["profile"].shape)
+    left = before["profile"].values + (fitted @ difference.value).reshape(before["profile"].shape)
     scatter, _, freedom = scatter_and_drift(before)
     _, drift, _ = scatter_and_drift(after)
     course = drift[np.isin(after["cycle"].values, cycles)]
@@ -857,10 +856,10 @@ def _records(before: ComparedCampaign, after: ComparedCampaign) -> Iterator[Chan
         expected = [float(was + moved @ one.coefficients) for one in both]
         open_um2 = sum(one.noise_um**2 * (1.0 + one.ratio * between_s) + moved @ one.covariance @ moved for one in both)
         u = math.sqrt(open_um2 + (expected[1] - expected[0]) ** 2 / 4.0)
-        level = Quantity(value=sum(expected) / 2.0, u=u), Quantity(value=float(now), u=None)
-        change = Quantity(value=float(now) - sum(expected) / 2.0, u=u)
-        p = float(2.0 * special.ndtr(-abs(float(now) - sum(expected) / 2.0) / u))
-        yield Change(name, "level", None, "um", *level, change, p, machine=True)
+        due = sum(expected) / 2.0
+        off = float(now) - due
+        level = Quantity(value=due, u=u), Quantity(value=float(now), u=None), Quantity(value=off, u=u)
+        yield Change(name, "level", None, "um", *level, float(2.0 * special.ndtr(-abs(off) / u)), machine=True)
         noises = (Quantity(value=one.noise_um, u=None) for one in both)
         yield _difference(name, "noise", "um", *noises, machine=False)
 

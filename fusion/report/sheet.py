@@ -110,7 +110,7 @@ class Sheet:
 
 
 def describe_sheet(
-    title: str, part: Iso230Part, *, files: Mapping[str, str], version: str, own: Letterhead | None = None
+    title: str, part: Iso230Part, *, files: Mapping[str, str], version: str, own: Letterhead = PLAIN
 ) -> Sheet:
     """Return what the sheet of a test by ISO 230-2 shows."""
     requirements = [[check.name, _MET[check.met], check.evidence] for check in part.checks]
@@ -124,7 +124,7 @@ def describe_sheet(
         requirements=table([Words("Requirement of ISO 230-2"), Words("Met"), Words("Found")], requirements),
         files=files,
         version=version,
-        own=own or PLAIN,
+        own=own,
     )
     return shown.in_its_language()
 
@@ -226,10 +226,10 @@ def write_thermal_tests(
     *,
     files: Mapping[str, str],
     version: str,
-    own: Letterhead | None = None,
+    own: Letterhead = PLAIN,
 ) -> None:
     """Write the sheets of tests by ISO 230-3 in the format of the file's name; nothing is replaced."""
-    sheets = [describe_thermal_sheet(title, one, files=files, version=version, own=own or PLAIN) for one in tests]
+    sheets = [describe_thermal_sheet(title, one, files=files, version=version, own=own) for one in tests]
     if page_format(path, ".html", ".pdf", ".docx") == ".docx":
         drawn = [(sheet, plot_thermal_test(test)) for sheet, test in zip(sheets, tests, strict=True)]
         write_atomically(path, lambda temporary: _write_word(temporary, drawn))

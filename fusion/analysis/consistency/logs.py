@@ -13,6 +13,7 @@ from fusion.analysis.alignment.align import both_ends, covered_share, likely_zon
 from fusion.analysis.alignment.sensor_health import Kind, examine_sensors
 from fusion.analysis.consistency.checks import CLOCK, LOG, Found, check, judge
 from fusion.common import Array
+from fusion.results.recursion import first_order_weights
 
 #: Temperatures of the environment log.
 _CONTACT_SENSORS = ("air_temperature", "material_temperature")
@@ -198,11 +199,10 @@ def _between_rows(at: Array, load: Array) -> float:
     grid = even_times(at)
     held = load[known][np.searchsorted(at[known], grid, side="right").clip(1) - 1]
     courses = np.column_stack([np.interp(grid, at[known], load[known]), held])
-    # The exact response of `respond` at even times: an exponential average of what each step adds, without a kernel to load.
+    # At even times an exponential average of what each step adds, without a kernel to load.
     step = grid[1] - grid[0] if grid.size > 1 else SOURCE_S[0]
-    decay = np.exp(-step / SOURCE_S[0])
-    ramp = np.diff(courses, axis=0) * SOURCE_S[0] / step
-    added = (courses[1:] - ramp - decay * (courses[:-1] - ramp)) / (1.0 - decay)
+    decay, now, before = first_order_weights(SOURCE_S[0], step)
+    added = (now * courses[1:] + before * courses[:-1]) / (1.0 - decay)
     averages = pd.DataFrame(np.vstack([courses[:1], added])).ewm(alpha=1.0 - decay, adjust=False)
     responses = averages.mean().to_numpy()
     return float(np.var(responses[:, 1] - responses[:, 0]) / max(float(np.var(responses[:, 1])), 1e-30))

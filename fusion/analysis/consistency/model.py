@@ -16,6 +16,7 @@ from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine
 from fusion.analysis.alignment.readings import Series
 from fusion.analysis.consistency.checks import CLOCK, LOG, Found, check, judge
 from fusion.analysis.drift_model.model import ModelFit, Term, place_of, refit_fixed
+from fusion.analysis.drift_model.search import say
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
 from fusion.analysis.levels import LINE_LEVEL, REMAINDER_LEVEL
 from fusion.common import Array
@@ -246,13 +247,11 @@ def withhold_names(loop: Mapping[str, Any], effects: Mapping[str, Effect]) -> di
 
     def why(step: Mapping[str, Any]) -> str:
         if step["effect"] in _SHAPED_AS_EXPANSION and math.isinf(alone_u):
-            return (
-                "beside it these readings do not tell the expansion of the axis, which looks alike along another line"
-            )
+            return say("withheld", "expansion_untold")
         if abs(off) > _LIMIT and (effects[step["effect"]].excited_by or step["effect"] in _SHAPED_AS_EXPANSION):
-            return f"beside it the axis would expand by {alone:.3g} ± {alone_u:.2g} ppm/K, which the stated coefficient contradicts"
+            return say("withheld", "expansion_contradicts", alone=alone, alone_u=alone_u)
         if structure_um > step["rms_um"] and not {"time_s", "period_min"} & set(step["parameters"]):
-            return f"its {step['rms_um']:.2g} µm are less than the {structure_um:.2g} µm of structure that are left beside it"
+            return say("withheld", "less_than_is_left", rms_um=step["rms_um"], structure_um=structure_um)
         return ""
 
     steps = [{**step, "withheld": step["withheld"] or why(step)} for step in loop["steps"]]
