@@ -373,7 +373,8 @@ def test_a_sheet_is_that_of_the_laboratory_and_in_its_language(stated, tmp_path)
         page_template=str(tmp_path / "lab.html"), language="de",
     )  # fmt: skip
     plain, sheet = (
-        describe_sheet(stated.title, stated.part, files=stated.files, version="0", own=one) for one in (Letterhead(), own)
+        describe_sheet(stated.title, stated.part, files=stated.files, version="0", own=one)
+        for one in (Letterhead(), own)
     )
     # Every sentence of the program is in the catalogue; what somebody stated stays as it is, and so do days.
     pairs = zip(
