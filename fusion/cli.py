@@ -161,7 +161,7 @@ def run(
         list[str],
         Argument(
             metavar="CAMPAIGN.toml...",
-            help="One campaign file or its address (s3://, https://), or two of one machine.",
+            help="One campaign file, its folder or its address (s3://, https://), or two of one machine.",
         ),
     ],
     out: Annotated[
@@ -293,8 +293,13 @@ def _progress(*, quiet: bool, json_progress: bool = False) -> Iterator[Report]:
 
 
 def _place(text: str) -> Path | str:
-    """Return an address as it is written, anything else as a path."""
-    return text if "://" in text else Path(text)
+    """Return an address as it is written, anything else as a path: of a folder, that of the campaign file in it."""
+    if "://" in text:
+        return text
+    from fusion.common import CAMPAIGN_FILE
+
+    path = Path(text)
+    return path / CAMPAIGN_FILE if path.is_dir() else path
 
 
 def _here(place: Path | str, what: str) -> Path:
@@ -431,7 +436,7 @@ def application(
 @app.command()
 def check(
     campaign: Annotated[
-        str, Argument(metavar="CAMPAIGN.toml", help="The campaign file, or its address (s3://, https://).")
+        str, Argument(metavar="CAMPAIGN.toml", help="The campaign file, its folder, or its address (s3://, https://).")
     ],
     as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print faults and doubts only.")] = False,

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = "NDArray[np.float64]"
 
+#: The file that makes a folder a campaign, looked for where a folder is named.
+CAMPAIGN_FILE = "campaign.toml"
 
 #: Packages whose version can change a number in the results.
 _PACKAGES = (

@@ -59,7 +59,7 @@ from fusion.campaign.values import (
     split_uncertainty,
     stored_path,
 )
-from fusion.common import FusionError, TomlError, describe, first_faults, place_in, read_toml, suggest
+from fusion.common import CAMPAIGN_FILE, FusionError, TomlError, describe, first_faults, place_in, read_toml, suggest
 from fusion.messages import near_file
 from fusion.results.store import is_text
 from thermofuse.units import UnitName
@@ -1161,15 +1161,15 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
     >>> load_campaign("absent.toml")  # doctest: +ELLIPSIS
     Traceback (most recent call last):
         ...
-    fusion.campaign.config.CampaignError: ...absent.toml: no such campaign file; check the name or give its full path
+    fusion.campaign.config.CampaignError: ...absent.toml: no such campaign file; ...
     """
     path = Path(path).resolve()
     if path.is_dir():
-        raise CampaignError(f"{path} is a folder; name the campaign file in it, for example {path / 'campaign.toml'}")
+        path /= CAMPAIGN_FILE
     try:
         content, text = read_toml(path)
     except FileNotFoundError:
-        raise CampaignError(f"{path}: no such campaign file; check the name or give its full path") from None
+        raise CampaignError(f"{path}: no such campaign file; check the name, or let thermofuse init write it") from None
     except UnicodeDecodeError as error:
         raise CampaignError(f"{path}: byte {error.start} is not UTF-8; save the campaign file as UTF-8 text") from None
     except TomlError as error:

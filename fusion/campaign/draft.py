@@ -17,7 +17,7 @@ from fusion.campaign.columns import ROLES, UNIT_NOT_KNOWN, ColumnsError, TablePr
 from fusion.campaign.inspect import FolderContent, Kind, Recognised, scan_folder
 from fusion.campaign.schema import Key, keys_of, known_keys
 from fusion.campaign.values import column_conversion, role_of_unit
-from fusion.common import FusionError
+from fusion.common import CAMPAIGN_FILE, FusionError
 from fusion.results.progress import counted
 from fusion.results.store import is_text, write_text
 from interferometry.common import InterferometryError
@@ -85,7 +85,6 @@ class Asker:
         return names[0] if len(names) == 1 else self.checked(f"{question} ({', '.join(names)})", names[0], check)
 
 
-_FILE = "campaign.toml"
 _TITLE = "Title of the report"
 #: Beginning of a drafted file, by which its examples in comments are distinguished from comments that somebody wrote.
 DRAFTED = "# Written by thermofuse init."
@@ -164,7 +163,7 @@ def _asking_once(ask: Ask, answers: dict[str, str]) -> Ask:
 
 def _refuse_place(folder: Path) -> None:
     """Refuse a folder that takes no new campaign file."""
-    path = folder / _FILE
+    path = folder / CAMPAIGN_FILE
     if not folder.is_dir():
         raise DraftError(f"{folder}: no such folder; name the folder that holds the files of the measurement")
     if path.exists():
@@ -178,7 +177,7 @@ def _refuse_place(folder: Path) -> None:
 def write_campaign(folder: Path, asker: Asker, content: FolderContent | None = None) -> tuple[Path, list[str]]:
     """Write a commented campaign file into a folder; `content` is what it takes, left out: everything in the folder."""
     _refuse_place(folder)
-    path, content = folder / _FILE, content or scan_folder(folder.resolve())
+    path, content = folder / CAMPAIGN_FILE, content or scan_folder(folder.resolve())
     lines = list(draft_lines(content, asker))
     unnamed = next((line for line in lines if not is_text(line)), None)
     if unnamed is not None:
@@ -210,7 +209,7 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
             + (f" ({unknown})" if unknown else "; name the folder that holds the files of the measurement")
         )
     yield f"{DRAFTED} Every quantity carries its unit in the value; paths start from the folder of this file."
-    yield f'# A line with "{TO_FILL}" has to be completed; thermofuse check {_FILE} says what is still missing.'
+    yield f'# A line with "{TO_FILL}" has to be completed; thermofuse check {CAMPAIGN_FILE} says what is still missing.'
     yield ""
     yield "[campaign]"
     yield f"title = {_quoted(asker.text(_TITLE, content.folder.name or 'Campaign'))}"

@@ -16,7 +16,7 @@ import psutil
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.values import in_order
-from fusion.common import FusionError
+from fusion.common import CAMPAIGN_FILE, FusionError
 from fusion.pipeline.resume import kept_results
 from fusion.pipeline.workers import start_run
 from fusion.report.fleet import SUMMARY, Row, as_csv, as_json, read_rows, render_fleet, with_findings, write_book
@@ -30,8 +30,6 @@ from thermography.common import usable_processors
 
 #: Names in the folder of a fleet that are its own, in lower case: not every file system tells case apart.
 RESERVED = frozenset({"logs", "fleet.json", "fleet.csv", "fleet.xlsx", "fleet.html", MANIFEST, ".stages"})
-#: Campaign files that are looked for in a folder and in all folders in it.
-CAMPAIGN_FILE = "campaign.toml"
 
 
 class FleetError(FusionError):

@@ -17,10 +17,9 @@ from tomlkit.items import Array
 from fusion.app.parts import PathError
 from fusion.campaign.draft import DRAFTED, TO_FILL, Asker, draft_lines
 from fusion.campaign.inspect import leads_out, scan_folder
-from fusion.common import FusionError
+from fusion.common import CAMPAIGN_FILE, FusionError
 from fusion.results.store import write_atomically
 
-_FILE = "campaign.toml"
 #: Where the version of a campaign file goes that is replaced.
 _BEFORE = "campaign.toml.before"
 
@@ -91,7 +90,7 @@ class CampaignText:
 
 def open_campaign(folder: Path, root: Path | None = None) -> CampaignText:
     """Open the campaign file of a folder, or draft one where there is none; links out of `root`, else of the folder, are not followed."""
-    path, root = folder / _FILE, root or folder
+    path, root = folder / CAMPAIGN_FILE, root or folder
     if leads_out(path, root):
         raise PathError(f"{path} is a link to a place outside {root}; copy the file into the folder")
     if path.exists():

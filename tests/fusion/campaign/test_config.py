@@ -195,9 +195,12 @@ def test_an_effect_of_a_users_own_is_declared_where_it_says_so(folder: Path) -> 
 
 
 def test_no_campaign_file(folder: Path) -> None:
-    with pytest.raises(CampaignError, match=r"absent\.toml: no such campaign file; .* give its full path"):
+    with pytest.raises(CampaignError, match=r"absent\.toml: no such campaign file; check the name"):
         load_campaign(folder / "absent.toml")
-    with pytest.raises(CampaignError, match="is a folder; name the campaign file in it"):
+    load(folder, TEXT)
+    assert load_campaign(folder).path == folder.resolve() / "campaign.toml"
+    (folder / "campaign.toml").unlink()
+    with pytest.raises(CampaignError, match=r"campaign\.toml: no such campaign file; .* thermofuse init"):
         load_campaign(folder)
     (folder / "latin.toml").write_bytes(b'[campaign]\ntitle = "\xb5"\n')
     with pytest.raises(CampaignError, match="byte 20 is not UTF-8; save the campaign file as UTF-8 text"):
