@@ -55,32 +55,41 @@ def component_loadings(
 
 # Shape along the axis of a drift that shift, stretch and bend do not describe, from the readings themselves.
 
-#: Level at which a common motion of the targets is a shape.
-SHAPE_LEVEL = 0.01
+#: Level at which a common motion of the targets is a shape; along the course of the drift that is known there is one, and it is looked for
+#: at a level of its own.
+SHAPE_LEVEL, COURSE_LEVEL = 0.01, 0.02
 #: Least number of targets that take part in a shape (inverse participation ratio): fewer are positions that move by themselves.
 LEAST_TARGETS = 3.5
-#: Fewest cycles in which a shape is looked for.
-SHORTEST_TEST_CYCLES = 15
+#: Fewest cycles in which a shape is looked for along any course, and along that of the known drift.
+SHORTEST_TEST_CYCLES, SHORTEST_COURSE_CYCLES = 15, 8
 _PERMUTATIONS = 199
 _SEED = 0
 #: Shares that a cycle keeps from the one before it in the courses that are looked for: a rhythm of few cycles, and a warm-up.
 _KEPT = (0.1, 0.85)
 
 
-def common_shape(residual: Array, known: Array) -> Array | None:
-    """Return the shape along the axis of a motion over the cycles that the known shapes leave."""
+def common_shape(residual: Array, known: Array, course: Array) -> Array | None:
+    """Return the shape along the axis of a motion over the cycles that the known shapes leave, if any: one along the course of the known
+    drift (cycles,), as of a part that warms with the others, or along another one.
+    """
     cycles, targets = residual.shape
-    if cycles < SHORTEST_TEST_CYCLES or targets < known.shape[1] + 2:
+    if cycles < SHORTEST_COURSE_CYCLES or targets < known.shape[1] + 2:
         return None
     remainder = _without(residual, known)
-    whitened = remainder[1:] - _memory(remainder) * remainder[:-1]
-    for kept in _KEPT:
-        values, vectors = np.linalg.eigh(_succession(whitened, kept))
-        shape = vectors[:, -1]
-        rng = np.random.default_rng(_SEED)
-        permuted = [np.linalg.eigvalsh(_succession(rng.permutation(whitened), kept))[-1] for _ in range(_PERMUTATIONS)]
+    memory = _memory(remainder)
+    whitened, steps = (_without_memory(values, memory) for values in (remainder, course))
+    tried = [(np.outer(steps - steps.mean(), steps - steps.mean()), COURSE_LEVEL)]
+    if cycles >= SHORTEST_TEST_CYCLES:
+        tried += [(_succession(cycles, kept), SHAPE_LEVEL / len(_KEPT)) for kept in _KEPT]
+    for weights, level in tried:
+        values, vectors = np.linalg.eigh(whitened.T @ weights @ whitened)
+        shape, rng = vectors[:, -1], np.random.default_rng(_SEED)
+        permuted = [
+            np.linalg.eigvalsh(rows.T @ weights @ rows)[-1]
+            for rows in (rng.permutation(whitened) for _ in range(_PERMUTATIONS))
+        ]
         by_chance = (1 + np.count_nonzero(np.array(permuted) >= values[-1])) / (_PERMUTATIONS + 1)
-        if 1.0 / float((shape**4).sum()) >= LEAST_TARGETS and by_chance <= SHAPE_LEVEL / len(_KEPT):
+        if 1.0 / float((shape**4).sum()) >= LEAST_TARGETS and by_chance <= level:
             # Cycles near each other show that there is a shape; all of them together tell it best.
             shape = remainder.T @ (remainder @ shape)
             return np.asarray(shape / shape[np.argmax(np.abs(shape))])
@@ -105,10 +114,15 @@ def _memory(remainder: Array) -> float:
     return max(0.0, float(np.median(product[square > 0] / square[square > 0]))) if (square > 0).any() else 0.0
 
 
-def _succession(series: Array, kept: float) -> Array:
-    """Symmetric covariance of rows with the others, whose share falls by a factor from one row to the next."""
-    apart = np.abs(np.subtract.outer(np.arange(len(series)), np.arange(len(series))))
-    return np.asarray(series.T @ (kept**apart - np.eye(len(series))) @ series)
+def _without_memory(values: Array, memory: float) -> Array:
+    """Innovations of an autoregression over the cycles (cycles, ...), the first value with their variance."""
+    return np.concatenate([np.sqrt(1.0 - memory**2) * values[:1], values[1:] - memory * values[:-1]])
+
+
+def _succession(count: int, kept: float) -> Array:
+    """Weights of the products of different rows (count, count), which fall by a factor from one row to the next."""
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    return np.asarray(kept**apart - np.eye(count))
 
 
 #: Deletion residual, in standard deviations, from which a reading is flagged as an outlier: among 10,000 normal
@@ -410,7 +424,12 @@ def _missing_shape(joint: JointFit) -> Array | None:
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.bincount(cell, weight * joint.fit.residual(), minlength=total.size) / total
     known = joint.loadings(np.zeros(positions.size), positions)
-    return common_shape(mean.reshape(cycles.size, -1), known[:, (known != 0).any(axis=0)])
+    # Course of the drift that is known: the first principal component over the cycles.
+    levels = joint.fit.system.smooth(joint.fit.residual()[:, None]).levels[:, :, 0]
+    levels = levels + readings["seconds"].values[:, None] / 3600.0 * _rates(joint, joint.fit.coefficients)
+    moved = np.array([levels[cycle.ravel() == one].mean(axis=0) for one in range(cycles.size)]) @ known.T
+    course = np.linalg.svd(moved - moved.mean(axis=0), full_matrices=False)[0][:, 0]
+    return common_shape(mean.reshape(cycles.size, -1), known[:, (known != 0).any(axis=0)], course)
 
 
 def _missing_components(joint: JointFit) -> tuple[str, ...]:

@@ -90,9 +90,16 @@ def test_the_stated_uncertainty_covers_the_values_of_the_axis(name: str, capsys:
 
 
 def ranges_of(hours: np.ndarray, course: np.ndarray) -> dict[str, float]:
-    """Largest less smallest value of a course (n,) over the first hour, all of it and the last hour."""
-    parts = {"first_hour": hours - hours[0] <= 1.0, "whole": hours >= 0.0, "last_hour": hours >= hours[-1] - 1.0}
-    return {name: float(np.ptp(course[part])) for name, part in parts.items()}
+    """Largest less smallest value of a course (n,) over the first hour, all of it and the last hour, each to its very end."""
+    ends = {
+        "first_hour": hours[0] + np.array([0.0, 1.0]),
+        "whole": hours[[0, -1]],
+        "last_hour": hours[-1] - np.array([1.0, 0.0]),
+    }
+    return {
+        name: float(np.ptp([*course[(hours >= first) & (hours <= last)], *np.interp([first, last], hours, course)]))
+        for name, (first, last) in ends.items()
+    }
 
 
 @pytest.mark.parametrize("cycles", [20, 30, 60])

@@ -66,6 +66,14 @@ def held(values: Array, rng: np.random.Generator) -> Array:
     return np.where(rng.random(values.shape) < 0.15, np.roll(values, 1, axis=2), values)
 
 
+def mixed(values: Array, rng: np.random.Generator) -> Array:
+    """Every reading of a pass but its first is averaged half with the one before."""
+    read = values.copy()
+    values[:, 0, 1:] = 0.5 * (read[:, 0, 1:] + read[:, 0, :-1])
+    values[:, 1, :-1] = 0.5 * (read[:, 1, :-1] + read[:, 1, 1:])
+    return values
+
+
 def other_unit(values: Array, rng: np.random.Generator) -> Array:
     """From the middle on the readings are in units of 10 µm."""
     values[len(values) // 2 :] /= 10.0
@@ -89,6 +97,7 @@ LIES: dict[str, tuple[str, Callable[[Array, np.random.Generator], Array]]] = {
     "a trigger missed in one approach": ("missed_trigger", missed_in_one_approach),
     "a trigger missed for a quarter of the cycles": ("missed_trigger", missed_for_a_while),
     "a seventh held from the target before": ("repeated_value", held),
+    "averaged half with the one before": ("mixed_readings", mixed),
     "another unit from the middle on": ("deviation_unit", other_unit),
     "approaches exchanged from the middle on": ("approach_labels", exchanged_approaches),
 }

@@ -34,6 +34,9 @@ _COINCIDENCE = 1e-6
 #: The same for a change of the profile that looks like a shift by one target, of the one largest change; it is an upper bound, which
 #: sound readings reach in far fewer tests.
 _SHIFT_BY_CHANCE = 1e-2
+#: Correlation of steps two targets apart: noise with a memory of any length shows -0.125 and more, twice as much is a share of the reading
+#: before; steps are clipped at so many standard deviations.
+_MEMORY_AT_LEAST, _LEAST_MIXED, _CLIPPED_AT = -0.125, -0.25, 4.0
 #: Cycles between which stretches of a test are compared with the rest; of a longer test so many, evenly.
 _MOST_BOUNDS = 60
 #: Cycles that are compared with all others at once.
@@ -241,6 +244,33 @@ def _held_readings(deviations: xr.Dataset) -> Found | None:
     if count < 2 or float(special.gammainc(count, expected)) >= _COINCIDENCE:
         return None
     return judge(count, expected, passed=False, um=None)
+
+
+@check("source", LASER)
+def mixed_readings(linear: xr.Dataset) -> Found:
+    """Correlation of the steps from target to target with those two targets on, in the changes from cycle to cycle: at least
+    `_LEAST_MIXED`, or no three standard errors below `_MEMORY_AT_LEAST`; readings that hold half of the one before show -0.5.
+    """
+    values = linear["deviation"].values[:, :, np.argsort(linear["position"].values)]
+    steps = np.diff(np.diff(values, axis=0), axis=2)
+    known = steps[np.isfinite(steps)]
+    scatter_um = scatter_by_median(known) if known.size else 0.0
+    if not scatter_um > 0.0:
+        return judge(0.0, _LEAST_MIXED, passed=True)
+    # A reading far off says nothing of the others.
+    steps = np.clip(steps / scatter_um, -_CLIPPED_AT, _CLIPPED_AT)
+    variance, pairs, correlations = np.nanmean(steps**2), 0, []
+    for lag in (2, 3, 4):
+        products = steps[..., :-lag] * steps[..., lag:]
+        of_lag = int(np.isfinite(products).sum())
+        pairs = pairs or of_lag
+        correlations.append(float(np.nanmean(products) / variance) if of_lag else 0.0)
+    two, *further = correlations
+    # Bartlett 1946 for steps of independent readings; changes over the cycles share readings, which counts as much again.
+    u = 1.5 / np.sqrt(max(pairs, 1))
+    # What swings from reading to reading correlates further on as well.
+    passed = two >= min(_LEAST_MIXED, _MEMORY_AT_LEAST - 3.0 * u) or two >= -1.5 * max(map(abs, further))
+    return judge(two, _LEAST_MIXED, passed=passed)
 
 
 @check("source", LASER)

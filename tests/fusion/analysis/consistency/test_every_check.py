@@ -206,6 +206,7 @@ LIES: dict[str, Lie] = {
     "copied_cycles": copied(20, 19),
     "copied_targets": copied(np.s_[:, :, 7], np.s_[:, :, 6]),
     "repeated_value": of_readings(lambda values: np.minimum(values, np.quantile(values, 0.7)).round(4)),
+    "mixed_readings": of_readings(lambda values: 0.5 * (values + np.roll(values, 1, axis=2))),
     "missed_trigger": of_readings(missed),
     "approach_labels": from_cycle(20, lambda values: values[:, ::-1]),
     "datum": from_cycle(20, lambda values: values + 80.0),

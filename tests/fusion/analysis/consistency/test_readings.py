@@ -180,6 +180,19 @@ def test_readings_that_hold_the_target_before_are_named_with_their_number() -> N
     assert "hold what the target before or after them read" in check.evidence
 
 
+def test_readings_that_hold_a_part_of_the_one_before_are_told_from_noise_with_a_memory() -> None:
+    test, rng = sound(), np.random.default_rng(9)
+    values, noise = test["deviation"].values, rng.standard_normal((CYCLES, 2, TARGETS))
+    for target in range(1, TARGETS):
+        noise[:, :, target] = 0.6 * noise[:, :, target - 1] + 0.8 * noise[:, :, target]
+    swinging = 2.0 * np.sin(2.0 * np.pi * (np.arange(TARGETS) / 4.4 + rng.random((CYCLES, 2, 1))))
+    for added in (noise, swinging):
+        assert "mixed_readings" not in failed(with_deviation(test, values + added))
+    mixed = values.copy()
+    mixed[:, :, 1:] = 0.6 * values[:, :, 1:] + 0.4 * values[:, :, :-1]
+    assert "two targets on" in failed(with_deviation(test, mixed))["mixed_readings"].evidence
+
+
 def test_coincidences_are_no_chance_in_sound_tests_of_all_lengths_and_resolutions() -> None:
     """Two cycles and more, fine and coarse, with a profile that changes at one cycle, a target at zero, and compensated afterwards."""
     for seed, (cycles, step_um) in enumerate([(2, 0.1), (3, 1.0), (5, 0.001), (12, 0.5), (40, 0.3), (40, 10.0)]):
