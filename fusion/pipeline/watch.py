@@ -32,9 +32,8 @@ from interferometry.io.readings import LongTable, check_and_assemble, find_long_
 from interferometry.io.tables import DELIMITERS, Grid, decode_text, split_lines
 from interferometry.iso230 import QUANTITIES, STANDARD_CYCLES, evaluate_iso230
 from thermography.common import ThermographyError
-from thermography.fields.blocks import BLOCK_FRAMES, reduce_block
+from thermography.fields.blocks import BLOCK_FRAMES, Registrations, reduce_block
 from thermography.fields.moving import reduce_moving_frames
-from thermography.fields.still import Registrations
 from thermography.io.fff_record import MAGIC
 from thermography.io.flir import index_sequence
 from thermography.io.frame import FrameReference, RejectedFrame

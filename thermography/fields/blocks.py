@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermography.common import Array, ThermographyError
 from thermography.fields.cycle_fields import noise_of_differences
-from thermography.fields.resampling import PlanWeights
+from thermography.fields.resampling import PlanWeights, plan_weights, plan_window
 from thermography.io.frame import CameraParameters, FrameReference
 from thermography.io.sequence import FrameList, WindowReader
 from thermography.radiometry.averaging import (
@@ -23,7 +24,8 @@ from thermography.radiometry.averaging import (
 )
 from thermography.radiometry.camera import Detector
 from thermography.radiometry.planck import calibrate
-from thermography.registration.displacement import FiducialMonitor, RegistrationSpan
+from thermography.registration.displacement import FiducialMonitor, RegistrationSpan, monitor_fiducials
+from thermography.registration.plan import PlanGrid
 
 # Inputs of a reduction: frames with their times, cycles and corrections, checked before any frame is read.
 
@@ -272,3 +274,34 @@ def _calibrate_per_frame(
         offset = total / count
         mean.variance[varying] = np.maximum(squares / count - offset**2, 0.0)
     mean.mean[varying] = reference + offset
+
+
+class Registrations:
+    """Registration spans in the order of time, and of each the weights and the monitor for the reduction of blocks, and the covariance of
+    the position of every cell (y, x, 2, 2), mm2.
+    """
+
+    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid, detector: Detector) -> None:
+        self.grid, self.detector = grid, detector
+        self.spans: list[RegistrationSpan] = []
+        self.sensors: list[RegisteredSensor] = []
+        self.covariances: list[Array] = []
+        for index, span in enumerate(spans):
+            self.insert(index, span)
+
+    def insert(self, index: int, span: RegistrationSpan) -> None:
+        """Insert a span before the one at `index`."""
+        registration, grid = span.registration, self.grid
+        # In parallel: the weights are compiled loops over pixels, the others many small steps of the interpreter.
+        with ThreadPoolExecutor(1) as executor:
+            monitor = executor.submit(monitor_fiducials, registration, grid, plan_window(registration, grid))
+            covariance = executor.submit(registration.position_covariance, grid.centres_mm)
+            weights = plan_weights(registration, grid, bad=self.detector.bad)
+            sensor = RegisteredSensor(weights, monitor.result(), self.detector)
+        self.spans.insert(index, span)
+        self.sensors.insert(index, sensor)
+        self.covariances.insert(index, covariance.result())
+
+    def stop_frame(self, index: int) -> int | None:
+        """First frame of the span after the one at `index`; None for the last."""
+        return self.spans[index + 1].first_frame if index + 1 < len(self.spans) else None

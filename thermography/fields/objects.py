@@ -1,4 +1,4 @@
-"""Parts of a still table that are not the table: objects laid on it or taken away, with their cells, and surfaces of another emissivity."""
+"""What a camera sees in place of the table: whoever stands before it, objects laid on it or taken away, surfaces of another emissivity."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from thermography.common import MAD_TO_SIGMA, ZERO_CELSIUS_K, Array
+from thermography.fields.blocks import Block, BlockResult, FrameSeries, Registrations
 from thermography.fields.cycle_fields import OBJECT, reference_cycle
 from thermography.io.frame import CameraParameters
+from thermography.io.sequence import WindowReader
 from thermography.large_arrays import median_of_pieces, piece_slices
-from thermography.radiometry.planck import black_body_signal
+from thermography.radiometry.planck import black_body_signal, calibrate
 
 #: A cell jumps if its change from one frame to the next exceeds its changes before and after by more than this, K, ...
 JUMP_K = 0.3
@@ -241,3 +243,89 @@ def describe_unnamed_surfaces(fields: xr.Dataset, parameters: CameraParameters) 
             emissivity = float(explained) if 0.0 < explained <= 1.0 else None
             found.append(_describe_place(cells, fields) | {"step_K": float(shown - around), "emissivity": emissivity})
     return found
+
+
+# Frames in which something stands before the table.
+
+#: A sampled pixel is off if it differs by more than this, K, ...
+_OFF_K = 0.5
+#: ... and by more than this many standard deviations of its noise.
+_OFF_SIGMAS = 8.0
+#: A frame is obstructed if more than this share of the sampled pixels is off, beyond single bad pixels.
+_OFF_SHARE = 0.02
+#: An obstruction passes within this time, s, or this number of frames; what stays longer is a change of the scene.
+_PASSING_S, _PASSING_FRAMES = 900.0, 5
+#: Number of frames whose median is the first state of the table.
+_FIRST_FRAMES = 5
+#: Least number of sampled pixels for the comparison.
+_LEAST_PIXELS = 30
+
+
+def pixels_off(values: Array, lowest: Array, highest: Array, noise_K: float) -> Array:
+    """Share of the pixels of every frame that lie outside a range, apart from a change that all pixels share."""
+    middle = (lowest + highest) / 2
+    level = np.nanmedian(values - middle, axis=1, keepdims=True)
+    beyond = np.maximum(values - level - highest, lowest - values + level)
+    off = beyond > np.nanmax([_OFF_K, _OFF_SIGMAS * noise_K])
+    return off.mean(axis=1)
+
+
+class Obstructions:
+    """Frames of a series in which something stands before the table."""
+
+    def __init__(self, frames: FrameSeries, registrations: Registrations) -> None:
+        self.frames, self.registrations = frames, registrations
+        self.found: set[int] = set()
+        self._span = -1
+        self._state = np.empty(0)
+        self._until = 0
+
+    def examine(self, block: Block, result: BlockResult) -> None:
+        """Compare the frames of a block with the last frame that shows the table, and with later ones where they differ."""
+        if result.samples.shape[1] < _LEAST_PIXELS:
+            return
+        if block.span != self._span:
+            # Median of the first frames of a registration span, of which less than half may be obstructed.
+            stop = self.registrations.stop_frame(block.span) or len(self.frames)
+            more = range(block.stop, min(block.first + _FIRST_FRAMES, stop))
+            state: Array = np.median(
+                [*result.samples[:_FIRST_FRAMES], *(self._sample(i, block.span) for i in more)], axis=0
+            )
+            self._span, self._state = block.span, state
+        # Whether frames surely show the same as one before: `pixels_off` without medians, ten times as fast, by a stricter limit.
+        change = result.samples - self._state
+        change -= change.mean(axis=1, keepdims=True)
+        if bool(((np.abs(change) <= 0.8 * _OFF_K).mean(axis=1) >= 1 - _OFF_SHARE).all()):
+            self._state = result.samples[-1]
+            return
+        for i, values in zip(range(block.first, block.stop), result.samples, strict=True):
+            if pixels_off(values[None], self._state, self._state, result.noise_K)[0] > _OFF_SHARE and (
+                i < self._until or self._passes(i, values, block, result.noise_K)
+            ):
+                self.found.add(i)
+            else:
+                self._state = values
+
+    def _passes(self, i: int, values: Array, block: Block, noise_K: float) -> bool:
+        """Whether a later frame shows the table as before, and this one lies outside what both show."""
+        ahead = 1
+        while i + ahead < (self.registrations.stop_frame(block.span) or len(self.frames)):
+            seconds = (self.frames.times[i + ahead] - self.frames.times[i]) / np.timedelta64(1, "s")
+            if ahead > _PASSING_FRAMES and seconds > _PASSING_S:
+                break
+            later = self._sample(i + ahead, block.span)
+            if pixels_off(later[None], self._state, self._state, noise_K)[0] <= _OFF_SHARE:
+                lowest, highest = np.minimum(self._state, later), np.maximum(self._state, later)
+                self._until = i + ahead
+                return bool(pixels_off(values[None], lowest, highest, noise_K)[0] > _OFF_SHARE)
+            ahead = ahead + 1 if ahead < _PASSING_FRAMES else 2 * ahead
+        return False
+
+    def _sample(self, i: int, span: int) -> Array:
+        """Temperature of the sampled pixels in a frame, (points,) degC."""
+        sensor, reference = self.registrations.sensors[span], self.frames.references[i]
+        buffer = np.empty((1, *sensor.weights.used.shape), np.uint16)
+        with WindowReader(sensor.weights.window) as reader:
+            counts = reader.read([reference], buffer)
+        sensor.detector.repair(counts, sensor.weights.window)
+        return calibrate(counts.ravel()[sensor.sampled], self.frames.override(reference))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby, pairwise
@@ -29,27 +28,25 @@ from thermography.fields.blocks import (
     Override,
     ReductionError,
     RegisteredSensor,
+    Registrations,
     cut_blocks,
     make_frame_series,
     reduce_block,
 )
 from thermography.fields.cycle_fields import CyclePart, assemble_fields
-from thermography.fields.resampling import plan_weights, plan_window
+from thermography.fields.objects import Obstructions
 from thermography.fields.scheduling import Pool, in_order, open_pool
 from thermography.io.files import write_atomically
 from thermography.io.frame import CameraParameters, FrameReference
-from thermography.io.sequence import WindowReader
 from thermography.large_arrays import Spool, fill_array
 from thermography.radiometry.averaging import MeanTemperature
 from thermography.radiometry.camera import Detector
-from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import (
     KNOCK_PX,
     SUSPECT_PX,
     RegistrationSpan,
     fiducial_displacement,
     image_displacement,
-    monitor_fiducials,
     register_after_knock,
     search_displacement,
     shift_registration,
@@ -126,27 +123,14 @@ def describe_reduction(
     }
 
 
-# A still table followed over the frames: their displacements, a registration for every time between knocks, and
-# frames in which something stands before the table.
+# A still table followed over the frames: their displacements, and a registration after every knock.
 
 #: Largest number of frames whose mean is registered after a knock, or examined where single frames have too little contrast.
 _MEAN_FRAMES = 8
 #: A displacement lasts if the first measurable one of this number of following frames shares it.
 _FOLLOWING_FRAMES = 3
-#: A sampled pixel is off if it differs by more than this, K, ...
-_OFF_K = 0.5
-#: ... and by more than this many standard deviations of its noise.
-_OFF_SIGMAS = 8.0
-#: A frame is obstructed if more than this share of the sampled pixels is off, beyond single bad pixels.
-_OFF_SHARE = 0.02
-#: An obstruction passes within this time, s, or this number of frames; what stays longer is a change of the scene.
-_PASSING_S, _PASSING_FRAMES = 900.0, 5
 #: Frames before a lasting displacement that show whether it had begun.
 _CREPT_FRAMES = 3
-#: Number of frames whose median is the first state of the table.
-_FIRST_FRAMES = 5
-#: Least number of sampled pixels for the comparison.
-_LEAST_PIXELS = 30
 
 
 @dataclass(frozen=True)
@@ -159,37 +143,6 @@ class Knock:
     span: int
     displacement_px: Array
     by_image: bool
-
-
-class Registrations:
-    """Registration spans in the order of time, and of each the weights and the monitor for the reduction of blocks, and the covariance of
-    the position of every cell (y, x, 2, 2), mm2.
-    """
-
-    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid, detector: Detector) -> None:
-        self.grid, self.detector = grid, detector
-        self.spans: list[RegistrationSpan] = []
-        self.sensors: list[RegisteredSensor] = []
-        self.covariances: list[Array] = []
-        for index, span in enumerate(spans):
-            self.insert(index, span)
-
-    def insert(self, index: int, span: RegistrationSpan) -> None:
-        """Insert a span before the one at `index`."""
-        registration, grid = span.registration, self.grid
-        # In parallel: the weights are compiled loops over pixels, the others many small steps of the interpreter.
-        with ThreadPoolExecutor(1) as executor:
-            monitor = executor.submit(monitor_fiducials, registration, grid, plan_window(registration, grid))
-            covariance = executor.submit(registration.position_covariance, grid.centres_mm)
-            weights = plan_weights(registration, grid, bad=self.detector.bad)
-            sensor = RegisteredSensor(weights, monitor.result(), self.detector)
-        self.spans.insert(index, span)
-        self.sensors.insert(index, sensor)
-        self.covariances.insert(index, covariance.result())
-
-    def stop_frame(self, index: int) -> int | None:
-        """First frame of the span after the one at `index`; None for the last."""
-        return self.spans[index + 1].first_frame if index + 1 < len(self.spans) else None
 
 
 class Displacements:
@@ -290,76 +243,6 @@ def _alike(displacement_px: Array, other_px: Array) -> bool:
     """Whether a displacement is a knock, and the same as another one."""
     size, other, difference = map(np.linalg.norm, (displacement_px, other_px, displacement_px - other_px))
     return bool(size > KNOCK_PX and difference < max(KNOCK_PX, 0.3 * float(other)))
-
-
-def pixels_off(values: Array, lowest: Array, highest: Array, noise_K: float) -> Array:
-    """Share of the pixels of every frame that lie outside a range, apart from a change that all pixels share."""
-    middle = (lowest + highest) / 2
-    level = np.nanmedian(values - middle, axis=1, keepdims=True)
-    beyond = np.maximum(values - level - highest, lowest - values + level)
-    off = beyond > np.nanmax([_OFF_K, _OFF_SIGMAS * noise_K])
-    return off.mean(axis=1)
-
-
-class Obstructions:
-    """Frames of a series in which something stands before the table."""
-
-    def __init__(self, frames: FrameSeries, registrations: Registrations) -> None:
-        self.frames, self.registrations = frames, registrations
-        self.found: set[int] = set()
-        self._span = -1
-        self._state = np.empty(0)
-        self._until = 0
-
-    def examine(self, block: Block, result: BlockResult) -> None:
-        """Compare the frames of a block with the last frame that shows the table, and with later ones where they differ."""
-        if result.samples.shape[1] < _LEAST_PIXELS:
-            return
-        if block.span != self._span:
-            # Median of the first frames of a registration span, of which less than half may be obstructed.
-            stop = self.registrations.stop_frame(block.span) or len(self.frames)
-            more = range(block.stop, min(block.first + _FIRST_FRAMES, stop))
-            state: Array = np.median(
-                [*result.samples[:_FIRST_FRAMES], *(self._sample(i, block.span) for i in more)], axis=0
-            )
-            self._span, self._state = block.span, state
-        # Whether frames surely show the same as one before: `pixels_off` without medians, ten times as fast, by a stricter limit.
-        change = result.samples - self._state
-        change -= change.mean(axis=1, keepdims=True)
-        if bool(((np.abs(change) <= 0.8 * _OFF_K).mean(axis=1) >= 1 - _OFF_SHARE).all()):
-            self._state = result.samples[-1]
-            return
-        for i, values in zip(range(block.first, block.stop), result.samples, strict=True):
-            if pixels_off(values[None], self._state, self._state, result.noise_K)[0] > _OFF_SHARE and (
-                i < self._until or self._passes(i, values, block, result.noise_K)
-            ):
-                self.found.add(i)
-            else:
-                self._state = values
-
-    def _passes(self, i: int, values: Array, block: Block, noise_K: float) -> bool:
-        """Whether a later frame shows the table as before, and this one lies outside what both show."""
-        ahead = 1
-        while i + ahead < (self.registrations.stop_frame(block.span) or len(self.frames)):
-            seconds = (self.frames.times[i + ahead] - self.frames.times[i]) / np.timedelta64(1, "s")
-            if ahead > _PASSING_FRAMES and seconds > _PASSING_S:
-                break
-            later = self._sample(i + ahead, block.span)
-            if pixels_off(later[None], self._state, self._state, noise_K)[0] <= _OFF_SHARE:
-                lowest, highest = np.minimum(self._state, later), np.maximum(self._state, later)
-                self._until = i + ahead
-                return bool(pixels_off(values[None], lowest, highest, noise_K)[0] > _OFF_SHARE)
-            ahead = ahead + 1 if ahead < _PASSING_FRAMES else 2 * ahead
-        return False
-
-    def _sample(self, i: int, span: int) -> Array:
-        """Temperature of the sampled pixels in a frame, (points,) degC."""
-        sensor, reference = self.registrations.sensors[span], self.frames.references[i]
-        buffer = np.empty((1, *sensor.weights.used.shape), np.uint16)
-        with WindowReader(sensor.weights.window) as reader:
-            counts = reader.read([reference], buffer)
-        sensor.detector.repair(counts, sensor.weights.window)
-        return calibrate(counts.ravel()[sensor.sampled], self.frames.override(reference))
 
 
 # Stretches of a recording: what a thread or a worker of a cluster reads and reduces at a time, and how the sums are

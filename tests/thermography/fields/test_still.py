@@ -24,6 +24,7 @@ from tests.thermography.plan_scene import (
 from thermography.common import FIELDS
 from thermography.fields import still
 from thermography.fields.blocks import NO_CYCLE, ReductionError, RegisteredSensor, cut_blocks, make_frame_series
+from thermography.fields.objects import pixels_off
 from thermography.fields.resampling import plan_weights
 from thermography.fields.still import (
     STRETCH_FRAMES,
@@ -32,7 +33,6 @@ from thermography.fields.still import (
     cut_stretches,
     describe_reduction,
     gather_frames,
-    pixels_off,
     reduce_frames,
     reduce_portion,
     reduce_stretch,
