@@ -749,9 +749,18 @@ def _describe(
         ),
     }
     reason = next((words for words, holds in reasons.items() if holds), "")
-    limit = found.ratio / suspicion.excess
-    changed = ramp.begin_s, ramp.begin_u_s, ramp.size_K, found.ratio, limit, reason, ramp.end_s
-    return SensorFault(suspicion.sensor, kind, not reason, *changed)
+    return SensorFault(
+        suspicion.sensor,
+        kind,
+        is_clear=not reason,
+        onset_s=ramp.begin_s,
+        onset_u_s=ramp.begin_u_s,
+        size=ramp.size_K,
+        ratio=found.ratio,
+        limit=found.ratio / suspicion.excess,
+        reason=reason,
+        end_s=ramp.end_s,
+    )
 
 
 def _shared_by_others(grid: Grid, sensor: int, others: list[int]) -> float:

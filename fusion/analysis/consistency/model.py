@@ -227,10 +227,6 @@ _LINES_SPAN = 0.1
 _BEYOND_SIGMAS = 3.0
 
 
-#: Effects whose shape along the axis an expansion along another line has too.
-_SHAPED_AS_EXPANSION = frozenset({"angular_growth", "pitch_error"})
-
-
 def _expansions(loop: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The declared expansion, where a coefficient is stated."""
     declared = loop.get("declared_coefficients", [])
@@ -246,9 +242,10 @@ def withhold_names(loop: Mapping[str, Any], effects: Mapping[str, Effect]) -> di
     structure_um = left["rms_um"] if left["shape"] and left["p_value"] < REMAINDER_LEVEL else 0.0
 
     def why(step: Mapping[str, Any]) -> str:
-        if step["effect"] in _SHAPED_AS_EXPANSION and math.isinf(alone_u):
+        effect = effects[step["effect"]]
+        if effect.like_expansion and math.isinf(alone_u):
             return say("withheld", "expansion_untold")
-        if abs(off) > _LIMIT and (effects[step["effect"]].excited_by or step["effect"] in _SHAPED_AS_EXPANSION):
+        if abs(off) > _LIMIT and (effect.excited_by or effect.like_expansion):
             return say("withheld", "expansion_contradicts", alone=alone, alone_u=alone_u)
         if structure_um > step["rms_um"] and not {"time_s", "period_min"} & set(step["parameters"]):
             return say("withheld", "less_than_is_left", rms_um=step["rms_um"], structure_um=structure_um)

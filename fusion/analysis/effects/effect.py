@@ -157,6 +157,8 @@ class Effect:
         Whether it may be present more than once.
     patterned : bool
         Whether it is told by nothing but its pattern along the axis.
+    like_expansion : bool
+        Whether an expansion along another line has its shape along the axis too.
     errs_camera : bool
         Whether it is an error of the camera: it makes the field wrong, not the drift.
     follows_field : bool
@@ -197,6 +199,7 @@ class Effect:
     declarable: bool = False
     repeats: bool = False
     patterned: bool = False
+    like_expansion: bool = False
     errs_camera: bool = False
     follows_field: bool = False
     longest_min: float = np.inf

@@ -33,7 +33,7 @@ _VISIBLE = 1e-6
 _OFF_GRID = 0.005
 
 
-@effect(masked_by=unmeasured_expansion, patterned=True)
+@effect(masked_by=unmeasured_expansion, patterned=True, like_expansion=True)
 def angular_growth(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """States times the square of the position."""
     for state, parameters in thermal_states(readings, near):
@@ -87,7 +87,7 @@ def _hidden_leads(readings: Readings) -> str:
     return lacks("leads", hidden=hidden) if hidden else ""
 
 
-@effect(patterned=True, limitation=_hidden_leads)
+@effect(patterned=True, like_expansion=True, limitation=_hidden_leads)
 def pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Waves along the axis times slow states."""
     states = list(thermal_states(readings, near))
