@@ -25,7 +25,7 @@ from fusion.analysis.drift_model.verification import (
     whole_response,
 )
 from fusion.analysis.levels import CHANGE_LEVEL
-from fusion.analysis.predicted_test import APPROACHES, predict_values, scatter_and_drift
+from fusion.analysis.predicted_test import APPROACHES, in_order, predict_values, scatter_and_drift
 from fusion.common import Array
 from fusion.results.axis import Iso230Part
 from fusion.results.loop import AxisLoop, Coefficient
@@ -669,7 +669,7 @@ def predict_here(
     What the table leaves of the first profile, with the shapes of the thermal state that fit the second one best, and the drift of these
     cycles. With H the projection on these shapes the errors are (I - H) of the first test and H of the second one.
     """
-    before, after = (_in_order(test) for test in (take_out(before, table), after))
+    before, after = (in_order(test) for test in (take_out(before, table), after))
     if len(cycles) < 2 or any(test.sizes["direction"] < len(APPROACHES) for test in (before, after)):
         return {}
     difference, left_out = _profile_difference(before, after)
@@ -687,13 +687,6 @@ def predict_here(
     course = drift[np.isin(after["cycle"].values, cycles)]
     one_table = bool(np.ptp(np.subtract(*table.correction_at(np.array(table.position_mm)))) < _SAME_REVERSAL_UM)
     return predict_values(left, covariance, scatter, [course], freedom, cycles=len(cycles), one_table=one_table)
-
-
-def _in_order(test: xr.Dataset) -> xr.Dataset:
-    """Return a test with its targets in the order of their positions, by the positive and the negative approach."""
-    order = np.argsort(test["position"].values)
-    sides = [side for side in APPROACHES if side in test["direction"].values]
-    return _by_direction(test.isel(target=order, other_target=order), sides)
 
 
 def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, same_setup: bool) -> PairComparison:

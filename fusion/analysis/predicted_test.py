@@ -17,13 +17,20 @@ APPROACHES = ("positive", "negative")
 _DRAWS, _SEED = 400, 20260309
 
 
+def in_order(test: xr.Dataset) -> xr.Dataset:
+    """Return a test with its targets in the order of their positions, by the positive and the negative approach."""
+    rows, order = (test[name].values for name in ("direction", "position"))
+    sides = [list(rows).index(side) for side in APPROACHES if side in rows]
+    at = {"direction": sides, "other_direction": sides, "target": np.argsort(order), "other_target": np.argsort(order)}
+    return test.isel(at).transpose(..., "direction", "target", "other_direction", "other_target")
+
+
 def scatter_and_drift(drift: xr.Dataset) -> tuple[Array, Array, float]:
-    """Return the standard deviation of a reading (2, n) and the drift (cycles, 2, n), um, in the order of the positions, and the degrees of
-    freedom of the former.
+    """Return the standard deviation of a reading (2, n) and the drift (cycles, 2, n), um, of a test `in_order`, and the degrees of freedom
+    of the former.
 
     Variances are drawn towards their mean as far as they differ by no more than chance (empirical Bayes: Smyth 2004, 3.3).
     """
-    drift = drift.sel(direction=list(APPROACHES)).isel(target=np.argsort(drift["position"].values))
     scatter = drift["scatter"].fillna(drift["scatter_position"]).transpose("direction", "target").values.astype(float)
     freedom = np.nan_to_num(drift["scatter_freedom"].transpose("direction", "target").values.astype(float))
     variance, known = scatter**2, (scatter > 0.0) & (freedom > 0.0)

@@ -26,7 +26,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from fusion.analysis.predicted_test import APPROACHES
+from fusion.analysis.predicted_test import APPROACHES, in_order
 from fusion.common import Array, FusionError
 from fusion.report.wording import environment, say, sentences
 from fusion.results.loop import RecordLoop
@@ -141,11 +141,8 @@ def _on_lines(at_mm: Array, position_mm: Array, values: Array) -> Array:
 
 def read_profile(deviations: xr.Dataset) -> Profile:
     """Return the profile of a run."""
-    drift = group(deviations, "estimate")
-    order = np.argsort(deviations["position"].values)
-    position = deviations["position"].values[order].astype(float)
-    chosen = drift.sel(direction=list(APPROACHES)).isel(target=order, other_target=order)
-    deviation = chosen["profile"].transpose("direction", "target").values
+    test = in_order(group(deviations, "estimate").assign(position=deviations["position"]))
+    position, deviation = test["position"].values.astype(float), test["profile"].values
     gaps = ~np.isfinite(deviation).all(axis=0)
     if gaps.any():
         raise ExportError(
@@ -153,11 +150,7 @@ def read_profile(deviations: xr.Dataset) -> Profile:
         )
     if position.size < 2:
         raise ExportError("one position only; a compensation table needs at least two")
-    swap = [list(deviations["direction"].values).index(name) for name in APPROACHES]
-    covariance = chosen["covariance"].isel(other_direction=swap)
-    return Profile(
-        position, deviation, covariance.transpose("direction", "target", "other_direction", "other_target").values
-    )
+    return Profile(position, deviation, test["covariance"].values)
 
 
 def tabulate(

@@ -15,7 +15,7 @@ import pandas as pd
 import xarray as xr
 
 from fusion.analysis.drift_model.recursion import make_recursion
-from fusion.analysis.predicted_test import predict_values, scatter_and_drift
+from fusion.analysis.predicted_test import in_order, predict_values, scatter_and_drift
 from fusion.common import Array
 from fusion.messages import naming
 from fusion.report.exports import maps, tables
@@ -312,7 +312,7 @@ def _predict_test(run: _Run, profile: Profile, table: ErrorTable, control: Contr
     iso = run.results.iso230
     cycles = len(iso.cycles) if iso is not None and iso.cycles else STANDARD_CYCLES
     forward, reverse = table.added_um(table.position_mm, one_table=control.one_table).tolist()
-    drift = group(run.deviations, "estimate").assign(position=run.deviations["position"])
+    drift = in_order(group(run.deviations, "estimate").assign(position=run.deviations["position"]))
     predicted = predict_test(
         profile, table, *scatter_and_drift(drift), cycles=max(cycles, 2), one_table=control.one_table
     )
