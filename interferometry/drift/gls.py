@@ -623,9 +623,9 @@ def _filter_with_average(
         if observed[k]:
             total = innovation_variance(covariance, order, loadings, k, memory, variance[k], cross_covariance)
             update_covariance(covariance, cross_covariance, total)
-            update_state(state, order, loadings, k, memory, columns[k], cross_covariance, total, innovation)
             for i in range(size):
                 gains[k, i] = cross_covariance[i] / total
+            update_state(state, order, loadings, k, memory, columns[k], gains[k], innovation)
         if weights[k] != 0.0:
             for c in range(components):
                 for j in range(columns.shape[1]):

@@ -104,29 +104,21 @@ def predict_state(state: Array, components: int, order: int, memory: Array, step
 
 @njit()
 def update_state(
-    state: Array,
-    order: int,
-    loadings: Array,
-    k: int,
-    memory: Array,
-    reading: Array,
-    cross_covariance: Array,
-    innovation_variance: float,
-    innovation: Array,
+    state: Array, order: int, loadings: Array, k: int, memory: Array, reading: Array, gains: Array, innovation: Array
 ) -> None:
     """Measurement update of the expected state of every column, in place: a = a + P Z' (y - Z a) / F (eq. 4.24)."""
+    components = loadings.shape[1]
+    # One loop over the columns for every term: the compiler then takes several columns at a time.
     for j in range(innovation.size):
-        innovation[j] = reading[j]
-    for c in range(loadings.shape[1]):
-        level, loading = state[c * order], loadings[k, c]
+        innovation[j] = state[components * order, j] if memory.size else 0.0
+    for c in range(components):
+        loading, level = loadings[k, c], state[c * order]
         for j in range(innovation.size):
-            innovation[j] -= loading * level[j]
-    if memory.size:
-        shared = state[loadings.shape[1] * order]
-        for j in range(innovation.size):
-            innovation[j] -= shared[j]
-    for i in range(cross_covariance.size):
-        gain, expected = cross_covariance[i] / innovation_variance, state[i]
+            innovation[j] += loading * level[j]
+    for j in range(innovation.size):
+        innovation[j] = reading[j] - innovation[j]
+    for i in range(gains.size):
+        gain, expected = gains[i], state[i]
         for j in range(innovation.size):
             expected[j] += gain * innovation[j]
 
@@ -195,20 +187,7 @@ def filter_columns(
         for c in range(components):
             for j in range(p):
                 states[k, c, j] = state[c * order, j]
-        # One loop over the columns for every term: the compiler then takes several columns at a time.
-        innovation = innovations[k]
-        for j in range(p):
-            innovation[j] = state[components * order, j] if memory.size else 0.0
-        for c in range(components):
-            loading, level = loadings[k, c], state[c * order]
-            for j in range(p):
-                innovation[j] += loading * level[j]
-        for j in range(p):
-            innovation[j] = columns[k, j] - innovation[j]
-        for i in range(m):
-            gain, expected = gains[k, i], state[i]
-            for j in range(p):
-                expected[j] += gain * innovation[j]
+        update_state(state, order, loadings, k, memory, columns[k], gains[k], innovations[k])
     return innovations, states
 
 
