@@ -426,48 +426,38 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     """Return the fit with larger process noise at the start, if that raises the restricted log-likelihood by at least 8."""
     system, problem = fit.system, _Problem.of(fit.response, fit.design)
     span = float(system.seconds[-1] - system.seconds[0])
-    first_s = _SETTLING_SHARE * span
-    # Of the mean over the test; with a little room, so that a fit at the limit can settle at all.
-    largest = _log_ratio_unit(system) + _LOG_RATIO_LIMITS[system.order][1] + 0.01
     searched, few = _for_search(system, problem)
     constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
-
-    def likelihood(log_ratio: Array, time_s: float, exponent: float) -> float:
-        scale = settling_noise_scale(searched.seconds, time_s, exponent)
-        # The drift hides everything else all the time.
-        if (log_ratio + np.log10(scale.mean()) > largest).any():
-            return -np.inf
-        return _log_likelihood(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
-
-    def with_same_mean(exponent: float) -> Array:
-        return np.log10(system.ratios / settling_noise_scale(searched.seconds, first_s, exponent).mean())
-
-    likely = max((1.0, 2.0), key=lambda exponent: likelihood(with_same_mean(exponent), first_s, exponent))
-    if likelihood(with_same_mean(likely), first_s, likely) < constant:
-        return fit
     components = system.ratios.size
-    guess = np.r_[with_same_mean(likely), np.log10(first_s), likely]
-    limits = np.log10(span * np.array(_SETTLING_LIMITS))
-    # The drift may hide everything on the way, where there is no gradient.
-    optimum = scipy.optimize.minimize(
-        lambda x: -likelihood(x[:components], 10.0 ** x[-2], x[-1]),
-        guess,
-        method="Nelder-Mead",
-        bounds=[(None, None)] * components + [tuple(limits), (0.0, _FASTEST_SETTLING)],
-        options={
-            "initial_simplex": np.vstack([guess, guess + np.diag([1.0] * components + [0.5, 1.0])]),
-            "xatol": 0.03,
-            "fatol": 1e-2,
-            "maxfev": 80 * guess.size,
-        },
-    )
-    if -optimum.fun < constant + _SETTLING_MARGIN:
+    # Of the mean over the test; with a little room, so that a fit at the limit can settle at all.
+    low, high = (limit + _log_ratio_unit(system) for limit in _LOG_RATIO_LIMITS[system.order])
+    limits = [
+        *zip(low, high + 0.01, strict=True),
+        np.log10(span * np.array(_SETTLING_LIMITS)),
+        (0.0, _FASTEST_SETTLING),
+    ]
+
+    def settling(x: Array, seconds: Array) -> Array:
+        return settling_noise_scale(seconds, 10.0 ** x[-2], x[-1])
+
+    def at_start(x: Array) -> Array:
+        return np.asarray(10.0 ** x[:components] / settling(x, searched.seconds).mean())
+
+    def likelihood(x: Array) -> float:
+        scale = settling(x, searched.seconds)
+        return _log_likelihood(replace(searched, ratios=at_start(x), process_noise_scale=scale), few)
+
+    starts = [np.r_[np.log10(system.ratios), np.log10(_SETTLING_SHARE * span), exponent] for exponent in (1.0, 2.0)]
+    likely = [likelihood(start) for start in starts]
+    if max(likely) < constant:
+        return fit
+    best, largest = _search(likelihood, starts[int(np.argmax(likely))], *np.array(limits).T)
+    if largest < constant + _SETTLING_MARGIN:
         return fit
     # By all components together: one that hardly moves may have any size.
     unit = 10.0 ** _log_ratio_unit(system)
-    start_scale = float((10.0 ** optimum.x[:components] / unit).sum() / (system.ratios / unit).sum())
-    settling = settling_noise_scale(system.seconds, 10.0 ** optimum.x[-2], optimum.x[-1])
-    scale = np.maximum(1.0, start_scale * settling)
+    start_scale = float((at_start(best) / unit).sum() / (system.ratios / unit).sum())
+    scale = np.maximum(1.0, start_scale * settling(best, system.seconds))
     return _solve(replace(system, process_noise_scale=scale), problem)
 
 
