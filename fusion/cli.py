@@ -1,4 +1,4 @@
-"""The command line, a function for each command. How it ends is in `fusion.messages`."""
+"""The command line, a function for each command. How it ends is in `fusion.common.messages`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from fusion.messages import (
+from fusion.common import NO_PLUGINS
+from fusion.common.messages import (
     ExitCode,
     Terminal,
     answering,
@@ -102,7 +103,7 @@ ResultsFolder = Annotated[Path, Argument(metavar="RESULTS", help="Results folder
 
 
 def _answering(folders: Sequence[Path] = ()) -> AbstractContextManager[None]:
-    """End a command as `fusion.messages` says; `folders` are those of its results."""
+    """End a command as `fusion.common.messages` says; `folders` are those of its results."""
     return answering(errors, kept=lambda: _kept(folders))
 
 
@@ -210,9 +211,7 @@ def run(
     places = [_place(text) for text in campaigns]
     folders = _folders(places, out)
     if no_plugins:
-        from fusion.analysis.effects.plugins import leave_plugins_out
-
-        leave_plugins_out()
+        os.environ[NO_PLUGINS] = "1"
     written, progress = [folder for _, folder in folders], partial(_progress, quiet=quiet, json_progress=json_progress)
     # The libraries may take seconds to load: something is seen before that. Nothing is written yet, and a library whose loading a signal
     # broke off cannot be loaded to say so.

@@ -91,7 +91,7 @@ def test_each_package_has_one_error_base_class():
         root = getattr(importlib.import_module(package), base)
         assert issubclass(root, ValueError)
         for path in (ROOT / package).rglob("*.py"):
-            module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
             for node in ast.parse(path.read_text(encoding="utf-8")).body:
                 if isinstance(node, ast.ClassDef) and node.name.endswith("Error") and node.bases:
                     thing = getattr(importlib.import_module(module), node.name)

@@ -267,7 +267,7 @@ def format_tables() -> dict[str, str]:
 
 def checks_table() -> str:
     """Return a row for every consistency check: what its docstring compares, with the limits in the code, and what hangs on it."""
-    conditions = environment(html=False).get_template("checks.j2").module.conditions
+    conditions = environment(html=False).get_template("consistency.j2").module.conditions
     lines = ["| code | what is compared, and its limit | what has to be right | else endangered |", "|---|---|---|---|"]
     first: dict[str, str] = {}
     for code, rule in RULES.items():

@@ -14,7 +14,7 @@ from fusion.app import parts as ui
 from fusion.app.results.charts import shown_if, to_scale
 from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
-from fusion.messages import reported
+from fusion.common.messages import reported
 from fusion.pipeline.watch import Enough, FinishedCycle, LiveState, follow
 from fusion.report.charts.plan import LAYERS, draw_map, extent_of
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, new_figure, span_words

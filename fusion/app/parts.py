@@ -15,7 +15,7 @@ from tornado.web import RequestHandler
 
 from fusion.app.runs import RUNS
 from fusion.common import FusionError
-from fusion.messages import printable, reported
+from fusion.common.messages import printable, reported
 
 _ROLES = {"fault": ' role="alert"', "warning": ' role="status"', "done": ' role="status"'}
 

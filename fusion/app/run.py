@@ -9,7 +9,7 @@ import panel as pn
 
 from fusion.app import parts as ui
 from fusion.app.runs import RUNS, RunError, RunProcess, is_begun
-from fusion.messages import ExitCode
+from fusion.common.messages import ExitCode
 from fusion.pipeline.resume import noted_campaign
 from fusion.results.store import finished_stages, noted_messages
 

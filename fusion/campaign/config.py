@@ -59,8 +59,9 @@ from fusion.campaign.values import (
     split_uncertainty,
     stored_path,
 )
-from fusion.common import CAMPAIGN_FILE, FusionError, TomlError, describe, first_faults, place_in, read_toml, suggest
-from fusion.messages import near_file
+from fusion.common import CAMPAIGN_FILE, FusionError, suggest
+from fusion.common.messages import near_file
+from fusion.common.toml_files import TomlError, describe, first_faults, place_in, read_toml
 from fusion.results.store import is_text
 from thermofuse.units import UnitName
 

@@ -40,7 +40,7 @@ from fusion.campaign.recompensation import RecompensationError, StatedBudget, co
 from fusion.campaign.time_zones import DATED, bring_to_utc, refuse_mixed_zones, utc, zone_notices
 from fusion.campaign.values import in_order, matching_pipes, name_and_unit
 from fusion.common import FusionError
-from fusion.messages import naming
+from fusion.common.messages import naming
 from fusion.results import axis as schema
 from fusion.results.progress import clock_notices, counted, left_out_notices, listed
 from fusion.results.results import Notice

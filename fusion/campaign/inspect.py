@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 import fusion
 import interferometry
 from fusion.campaign.values import column_unit, in_order, is_time
-from fusion.common import FusionError, TomlError, read_toml
-from fusion.messages import unforeseen
+from fusion.common import FusionError
+from fusion.common.messages import unforeseen
+from fusion.common.toml_files import TomlError, read_toml
 from fusion.results.folder import MANIFEST
 from fusion.results.inspection import describe_product, is_product
 from fusion.results.numbers import duration, join, moment, print_unit, span

@@ -24,7 +24,8 @@ from urllib.parse import quote, unquote, urljoin, urlsplit
 import filelock
 
 from fusion.campaign.values import FILE_KEYS
-from fusion.common import FusionError, TomlError, place_within, read_toml
+from fusion.common import FusionError, place_within
+from fusion.common.toml_files import TomlError, read_toml
 from fusion.results.progress import Report, silent
 from fusion.results.store import file_sha256, read_json_object, write_json
 from interferometry.common import InterferometryError

@@ -17,7 +17,7 @@ from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source, reader_of_deviations
 from fusion.campaign.inspect import Kind, Recording, time_bars
 from fusion.campaign.logs import NO_START, read_drivers
-from fusion.messages import BAD_INPUT
+from fusion.common.messages import BAD_INPUT
 from fusion.pipeline.consistency import (
     Check,
     ContradictionError,

@@ -17,7 +17,7 @@ from fusion.analysis.comparison import (
 )
 from fusion.analysis.drift_model.recursion import events_of
 from fusion.campaign.config import CampaignError, load_campaign
-from fusion.messages import naming
+from fusion.common.messages import naming
 from fusion.report.comparison import (
     campaign_names,
     conclude_comparison,

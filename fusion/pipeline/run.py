@@ -28,7 +28,7 @@ from fusion.campaign.inputs import (
 )
 from fusion.campaign.remote import fetched_campaign, is_address, require_outside_cache
 from fusion.campaign.time_zones import time_part
-from fusion.messages import naming
+from fusion.common.messages import naming
 from fusion.pipeline import attribution, drift_model, positioning, thermal
 from fusion.pipeline.consistency import (
     Check,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import rich.table
 
-from fusion.messages import cell
+from fusion.common.messages import cell
 from fusion.report.wording import (
     ARROWS,
     ISO230_TERMS,

@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.library import describe_effect
-from fusion.messages import cell, printable
+from fusion.common.messages import cell, printable
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window
 from fusion.results.loop import ERROR_BY_CHANCE, ChannelErrors, Loop, ModelError, Range, RecordLoop
 from fusion.results.numbers import (
@@ -322,8 +322,8 @@ def quoted_term(symbol: str) -> str:
 
 def check_words(code: str, facts: Mapping[str, Any]) -> dict[str, str]:
     """Return the words of a check; its remedy where it is not passed, or not verified."""
-    assumption, endangers = environment(html=False).get_template("checks.j2").module.conditions[code]  # type: ignore[attr-defined]
-    evidence, *remedy = sentences(code, facts, template="checks.j2")
+    assumption, endangers = environment(html=False).get_template("consistency.j2").module.conditions[code]  # type: ignore[attr-defined]
+    evidence, *remedy = sentences(code, facts, template="consistency.j2")
     needed = [] if facts["passed"] and facts["verified"] else remedy
     return {"assumption": assumption, "endangers": endangers, "evidence": evidence, "remedy": " ".join(needed)}
 

@@ -11,7 +11,8 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from fusion.common import Place, TomlError, describe, first_faults, place_in, read_toml, suggest
+from fusion.common import suggest
+from fusion.common.toml_files import Place, TomlError, describe, first_faults, place_in, read_toml
 from fusion.twin.effects import EFFECTS
 from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError
 from thermofuse.resources import resource

@@ -191,7 +191,7 @@ RECORD_LOOP: dict[str, Any] = {
 
 def told(code: str, *, passed: bool, verified: bool = True) -> Check:
     """A check by its code, as a run tells it."""
-    assumption, _ = environment(html=False).get_template("checks.j2").module.conditions[code]
+    assumption, _ = environment(html=False).get_template("consistency.j2").module.conditions[code]
     figures = RULES[code].figures if verified else ("field",)
     return Check(
         code=code, value=1.0, limit=0.5, passed=passed, verified=verified, evidence="It is off.", remedy="Check it.",

@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from fusion.common import FusionError
-from fusion.messages import ExitCode, answering, failed_code, interrupt_ends_step
+from fusion.common.messages import ExitCode, answering, failed_code, interrupt_ends_step
 
 pytestmark = pytest.mark.long
 
@@ -83,7 +83,7 @@ def test_a_fault_of_the_program_is_reported_without_data_of_the_user(
 def test_a_signal_ends_a_run_within_two_seconds(number: signal.Signals, busy: str, tmp_path: Path) -> None:
     """Also while a library is at work that does not look at signals: one key derivation of about a minute."""
     code = (
-        "import hashlib, time; from rich.console import Console; from fusion.messages import answering\n"
+        "import hashlib, time; from rich.console import Console; from fusion.common.messages import answering\n"
         "with answering(Console(stderr=True, soft_wrap=True), kept=lambda: 'out keeps fields'):\n"
         f"    print('ready', flush=True); {busy}"
     )
@@ -148,7 +148,7 @@ def test_a_signal_that_comes_when_everything_is_done_changes_nothing() -> None:
 def test_a_signal_ends_a_process_that_waits_for_a_thread(number: signal.Signals) -> None:
     """The thread sleeps for a minute; what was printed without a flush is not lost, and the code is that of what was done."""
     code = (
-        "import signal, sys, threading, time; from fusion.messages import leave\n"
+        "import signal, sys, threading, time; from fusion.common.messages import leave\n"
         "def last():\n"
         "    while signal.getsignal(signal.SIGTERM) is signal.SIG_DFL: time.sleep(0.01)\n"
         "    print('unflushed'); print('ready', file=sys.stderr, flush=True); time.sleep(60.0)\n"

@@ -11,7 +11,7 @@ import rich.table
 from typer.testing import CliRunner
 
 from fusion.cli import app
-from fusion.messages import Terminal, ascii_json, cell, printable, printable_json, short
+from fusion.common.messages import Terminal, ascii_json, cell, printable, printable_json, short
 from fusion.report.wording import print_table, table
 
 #: Clears the screen, renames the window, rings, goes back over the line, sets by C1, turns the direction of what follows.

@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inspect import Kind, recognise
-from fusion.common import TomlError, describe, find_line, key_lines, read_toml, suggest
+from fusion.common import suggest
+from fusion.common.toml_files import TomlError, describe, find_line, key_lines, read_toml
 from fusion.twin.recipe_file import RecipeError, read_recipe
 
 

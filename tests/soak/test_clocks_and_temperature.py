@@ -12,10 +12,9 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry
-from fusion.analysis.consistency.camera import Motion
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.consistency.field_series import field_at, thin_fields
-from fusion.analysis.consistency.material import log_with_camera
+from fusion.analysis.consistency.field_series import field_at, log_with_camera, thin_fields
+from fusion.analysis.consistency.motion import Motion
 from fusion.pipeline.consistency import Check, run_checks
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe

@@ -6,8 +6,6 @@ import itertools
 import json
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.align import both_ends, covered_share, likely_zone_shift
 from fusion.analysis.consistency.checks import CAMERA, CLOCK, Found, check, judge
 from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence
+from fusion.analysis.consistency.motion import Motion
 from fusion.common import Array
 from fusion.results.axis import RegistrationPart
 from fusion.results.parts import is_determined
@@ -29,14 +28,6 @@ from thermography.large_arrays import piece_slices
 
 # Checks of the times that the camera writes: order of the frames, rate of its clock, place in the motion of the axis.
 
-#: Frames nearer to each other than this share of a cycle are one burst.
-_BURST_SHARE = 0.25
-#: Scatter about a straight line, in cycles, up to which bursts keep their place in the cycle: triggered by the test, not by a timer.
-_LOCKED_CYCLES = 0.03
-#: Fewest bursts from which a rate is estimated, and share of the cycles that must have one.
-_LEAST_BURSTS, _LEAST_SHARE = 12, 0.6
-#: Largest slip from one burst to the next, in cycles: a timer of another period slips more, no clock gains a fifth.
-_LARGEST_STEP = 0.2
 #: Largest slip over the test, in cycles: a tenth of a cycle is what triggering by hand or by the axis makes.
 _LARGEST_SLIP = 0.1
 #: A shift by whole quarter hours counts as a wrong time zone where less than this share of the readings lies within the frames.
@@ -93,52 +84,10 @@ def _follows(before: FrameReference, after: FrameReference) -> bool:
     return (folder, stem, number + 1) == (next_folder, next_stem, next_number)
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Stamps of the frames of a still table, and the motion of the axis.
-
-    Attributes
-    ----------
-    seconds, cycle_end, reading_s : times of frames, ends of cycles and readings since the first frame, s
-    position_mm : of the readings
-    """
-
-    seconds: Array
-    cycle_end: Array
-    reading_s: Array
-    position_mm: Array
-
-    @classmethod
-    def of(cls, frame_time: NDArray[np.datetime64], deviations: xr.Dataset) -> Motion:
-        """Bring both to one clock."""
-        time = deviations["time"].values.astype("datetime64[ns]")
-        position = np.broadcast_to(deviations["position"].values, time.shape)
-        since = (time - frame_time[0].astype("datetime64[ns]")) / np.timedelta64(1, "s")
-        timed = ~np.isnat(time)
-        order = np.argsort(since[timed])
-        ends = np.array([row[known].max() for row, known in zip(since, timed, strict=True) if known.any()])
-        frames = (frame_time - frame_time[0]) / np.timedelta64(1, "s")
-        return cls(np.asarray(frames, float), ends, since[timed][order], position[timed][order])
-
-    @property
-    def period_s(self) -> float:
-        """Of the cycles; nan of less than two."""
-        return float(np.median(np.diff(self.cycle_end))) if self.cycle_end.size > 1 else np.nan
-
-    @cached_property
-    def locked(self) -> tuple[float, float] | None:
-        """Steady slip of the bursts of frames on the cycles, in cycles over the test and in s/h; None where they keep no place."""
-        return _lock(self.seconds, self.cycle_end, self.period_s) if self.cycle_end.size >= _LEAST_BURSTS else None
-
-    def away_share(self, late_s: float = 0.0) -> float:
-        """Share of the frames, were they late, that are stamped while the axis was away from position 0."""
-        return _away_share(self.seconds - late_s, self.reading_s, self.position_mm)
-
-
 @check("source", CLOCK, waits=True)
 def camera_rate(motion: Motion) -> Found:
-    """Gain of the camera's clock on the cycles, where frames are taken once per cycle at one place in it (scatter up to `_LOCKED_CYCLES`
-    cycles): slip over the test of at most `_LARGEST_SLIP` cycles.
+    """Gain of the camera's clock on the cycles, where every cycle has its frames at one place: slip over the test of at most
+    `_LARGEST_SLIP` cycles.
     """
     limit = (
         3600.0 * _LARGEST_SLIP * motion.period_s / float(np.ptp(motion.seconds)) if motion.cycle_end.size > 1 else 0.0
@@ -178,38 +127,6 @@ def compare_phase(motion: Motion | None) -> list[Evidence]:
         return []
     away = np.array([motion.away_share(QUARTER_S * k) for k in QUARTERS]) / _AWAY_SHARE
     return [Evidence("laser", "camera", away, away, TIMES, "place in the cycle")]
-
-
-def _lock(seconds: Array, cycle_end: Array, period: float) -> tuple[float, float] | None:
-    """As `Motion.locked`."""
-    starts = seconds[np.concatenate([[True], np.diff(seconds) > _BURST_SHARE * period])]
-    number = np.interp(starts, cycle_end, np.arange(cycle_end.size))
-    before, after = starts < cycle_end[0], starts > cycle_end[-1]
-    number[before] = (starts[before] - cycle_end[0]) / period
-    number[after] = cycle_end.size - 1 + (starts[after] - cycle_end[-1]) / period
-    place = np.unwrap(number - np.round(number), period=1.0)
-    if starts.size < max(_LEAST_BURSTS, _LEAST_SHARE * cycle_end.size):
-        return None
-    line = np.polyfit(starts, place, 1)
-    scatter = float(np.std(place - np.polyval(line, starts)))
-    step = abs(float(line[0] * np.median(np.diff(starts))))
-    if scatter > _LOCKED_CYCLES or step > _LARGEST_STEP:
-        return None
-    return float(line[0] * np.ptp(starts)), 3600.0 * float(line[0] * period)
-
-
-def _away_share(seconds: Array, reading_s: Array, position_mm: Array) -> float:
-    """Share of the frames, of those between first and last reading, with readings of one cycle away from axis position 0 on both sides."""
-    steps = np.diff(np.unique(np.abs(position_mm)))
-    near_mm = 0.5 * float(steps.min()) if steps.size else 0.0
-    typical = 3.0 * float(np.median(np.diff(reading_s)))
-    after = np.searchsorted(reading_s, seconds)
-    inside = (after > 0) & (after < reading_s.size)
-    at = np.clip(after, 1, reading_s.size - 1)
-    moving = (reading_s[at] - reading_s[at - 1] <= typical) & (
-        np.minimum(np.abs(position_mm[at]), np.abs(position_mm[at - 1])) > near_mm
-    )
-    return float(np.mean(moving[inside])) if inside.any() else 0.0
 
 
 #: Largest share of the pixels of a frame outside the range in which the camera is calibrated.

@@ -1,7 +1,7 @@
 """What a check is: a function by which inputs must agree, registered under its own name, the code of the check.
 
 A contradiction of facts ends the run before the long work; a doubt lets it go on and makes its conclusions conditional. What has to be
-right, what is endangered, evidence and remedy stand by the same code in ``fusion/report/templates/checks.j2``.
+right, what is endangered, evidence and remedy stand by the same code in ``fusion/report/templates/consistency.j2``.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from fusion.common import Array
 from fusion.results.parts import Figures
 
 if TYPE_CHECKING:
-    from fusion.analysis.consistency.camera import Motion
-    from fusion.analysis.consistency.field_series import FieldSeries
-    from fusion.analysis.consistency.material import Logged
+    from fusion.analysis.consistency.field_series import FieldSeries, Logged
+    from fusion.analysis.consistency.motion import Motion
     from fusion.results.axis import RegistrationPart
     from thermography.inspection import FileWarning
     from thermography.io.frame import FrameReference

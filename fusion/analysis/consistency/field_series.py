@@ -18,6 +18,8 @@ _COARSE_MM = 20.0
 _LEAST_STEP_S = 60.0
 #: Fewest frames from which a course can be distinguished from another one.
 LEAST_FRAMES = 12
+#: Smallest change of the logged temperature that can tell a slope, K.
+LEAST_CHANGE_K = 1.0
 
 
 @dataclass(frozen=True)
@@ -107,3 +109,43 @@ def _clock(frames: xr.DataArray) -> tuple[np.datetime64, Array]:
     """Time of the first frame, and seconds of all since then."""
     time = frames["time"].values.astype("datetime64[ns]")
     return time[0], (time - time[0]) / np.timedelta64(1, "s")
+
+
+@dataclass(frozen=True)
+class Logged:
+    """What the environment log holds of the table, with what the camera shows near its material sensor.
+
+    Attributes
+    ----------
+    near : the camera at the sensor's place, or everywhere where that is not known
+    inside : (n,) whether the log covers each frame
+    material : (m,) logged temperature at those that it covers, degC
+    air : (m,) that of the air, None where it is not logged
+    """
+
+    near: FieldSeries
+    inside: Array
+    material: Array
+    air: Array | None = None
+
+    @property
+    def change_K(self) -> float:
+        """Range of the material temperature."""
+        return float(np.ptp(self.material))
+
+    @property
+    def tells(self) -> bool:
+        """Whether it changes enough, over enough frames, to be compared."""
+        return self.change_K >= LEAST_CHANGE_K and bool(self.inside.sum() >= LEAST_FRAMES)
+
+
+def log_with_camera(near: FieldSeries | None, log: xr.Dataset | None) -> Logged | None:
+    """Bring the environment log to the frames; None where they have nothing in common."""
+    if near is None or log is None or "material_temperature" not in log:
+        return None
+    at = near.since_start(log["time"].values)
+    inside = (near.seconds >= at[0]) & (near.seconds <= at[-1])
+    if inside.sum() < 2:
+        return None
+    names = [name for name in ("material_temperature", "air_temperature") if name in log]
+    return Logged(near, inside, *(np.interp(near.seconds[inside], at, log[name].values) for name in names))

@@ -5,7 +5,6 @@ An emissivity error appears as a gain, a reflected-temperature error as an offse
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +12,14 @@ import numpy as np
 import xarray as xr
 
 from fusion.analysis.consistency.checks import CAMERA, LOG, Found, check, judge
-from fusion.analysis.consistency.field_series import LEAST_FRAMES, FieldSeries, field_at
+from fusion.analysis.consistency.field_series import (
+    LEAST_CHANGE_K,
+    LEAST_FRAMES,
+    FieldSeries,
+    Logged,
+    field_at,
+    log_with_camera,
+)
 from fusion.common import Array
 
 #: Largest difference between camera and sensors in standard uncertainties.
@@ -33,8 +39,6 @@ _CONTACT_SHARE = 2.0 * _CONTACT
 _UNKNOWN_PLACE = 0.07
 #: Drift of the camera's zero within a test that its correction leaves, K.
 _CAMERA_DRIFT_K = 0.05
-#: Smallest change of the logged temperature that can tell a slope, K.
-_LEAST_CHANGE_K = 1.0
 #: Share of the log's standard deviation that the cell most like it leaves at most: beyond, they share less than half of its variance.
 _LARGEST_LEFT = 0.7
 #: Share of the change of the least changing cell that the log has at least: a sensor on the table, also one in poor contact, shows more.
@@ -59,46 +63,6 @@ def compare_course(cells: Array, logged: Array) -> tuple[Array, float]:
     explained = product**2 / np.maximum((centred**2).sum(axis=0), 1e-12)
     left = np.maximum(target @ target - explained, 0.0)
     return np.sqrt(left / logged.size), float(target.std())
-
-
-@dataclass(frozen=True)
-class Logged:
-    """What the environment log holds of the table, with what the camera shows near its material sensor.
-
-    Attributes
-    ----------
-    near : the camera at the sensor's place, or everywhere where that is not known
-    inside : (n,) whether the log covers each frame
-    material : (m,) logged temperature at those that it covers, degC
-    air : (m,) that of the air, None where it is not logged
-    """
-
-    near: FieldSeries
-    inside: Array
-    material: Array
-    air: Array | None = None
-
-    @property
-    def change_K(self) -> float:
-        """Range of the material temperature."""
-        return float(np.ptp(self.material))
-
-    @property
-    def tells(self) -> bool:
-        """Whether it changes enough, over enough frames, to be compared."""
-        return self.change_K >= _LEAST_CHANGE_K and bool(self.inside.sum() >= LEAST_FRAMES)
-
-
-def log_with_camera(near: FieldSeries | None, log: xr.Dataset | None) -> Logged | None:
-    """Bring the environment log to the frames; None where they have nothing in common."""
-    if near is None or log is None or "material_temperature" not in log:
-        return None
-    at = near.since_start(log["time"].values)
-    inside = (near.seconds >= at[0]) & (near.seconds <= at[-1])
-    if inside.sum() < 2:
-        return None
-    names = [name for name in ("material_temperature", "air_temperature") if name in log]
-    return Logged(near, inside, *(np.interp(near.seconds[inside], at, log[name].values) for name in names))
 
 
 def rise_share_u(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bool) -> float | None:
@@ -134,7 +98,7 @@ def material_still(logged: Logged) -> Found:
     stated), where that is 1 K at least: at least `_LEAST_SHARE`.
     """
     least_K = float(np.ptp(logged.near.lagged(SENSOR_LAGS_S[-1])[logged.inside], axis=0).min())
-    testable = least_K >= _LEAST_CHANGE_K and logged.inside.sum() >= LEAST_FRAMES
+    testable = least_K >= LEAST_CHANGE_K and logged.inside.sum() >= LEAST_FRAMES
     share = logged.change_K / least_K if testable else 1.0
     facts = {"change_K": logged.change_K, "least_K": least_K, "testable": testable, "level": logged.material[0]}
     return judge(share, _LEAST_SHARE, passed=share >= _LEAST_SHARE, **facts)
@@ -225,7 +189,7 @@ def _agrees(logged: Logged, temperature: Array, *, stated: bool) -> bool:
 def _rise_limit(temperature: Array, *, stated: bool) -> float:
     """Share by which the camera's rise may differ from that of the log."""
     return (_CONTACT_SHARE if stated else _UNKNOWN_PLACE) + _CAMERA_DRIFT_K / max(
-        float(np.ptp(temperature)), _LEAST_CHANGE_K
+        float(np.ptp(temperature)), LEAST_CHANGE_K
     )
 
 
@@ -238,7 +202,7 @@ def _off(slopes: tuple[float, float]) -> float:
 def _slopes(logged: Logged, temperature: Array, *, stated: bool) -> tuple[float, float] | None:
     """Smallest and largest slope of the camera over the log that the data allow; None where it changes little or no cell follows it."""
     near, inside = logged.near, logged.inside
-    if float(np.ptp(temperature)) < _LEAST_CHANGE_K or inside.sum() < LEAST_FRAMES:
+    if float(np.ptp(temperature)) < LEAST_CHANGE_K or inside.sum() < LEAST_FRAMES:
         return None
     step = max(1, round(_SHORT_TERM_S / float(np.median(np.diff(near.seconds[inside])))))
     courses = []

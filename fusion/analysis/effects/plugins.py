@@ -1,4 +1,4 @@
-"""Effects that other installed distributions add: which ones there are, who brought them, and how to leave them out."""
+"""Effects that other installed distributions add: which ones there are, and who brought them."""
 
 from __future__ import annotations
 
@@ -11,26 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from fusion.analysis.effects.effect import Effect
-from fusion.common import FusionError
+from fusion.common import NO_PLUGINS, FusionError
 from fusion.results.parts import PluginPart
 
 #: Entry-point group of effects.
 GROUP = "thermofuse.effects"
-_LEFT_OUT = "THERMOFUSE_NO_PLUGINS"
 
 
 class PluginError(FusionError):
     """An effect of another distribution that cannot be used; the message names the distribution and how to leave it out."""
 
 
-def leave_plugins_out() -> None:
-    """Run with the built-in effects alone, here and in every process that this one starts."""
-    os.environ[_LEFT_OUT] = "1"
-
-
 def plugins() -> dict[PluginPart, EntryPoint]:
     """Return the effects that other distributions add, none of them loaded yet; none where they are left out."""
-    if os.environ.get(_LEFT_OUT):
+    if os.environ.get(NO_PLUGINS):
         return {}
     return {_describe(point): point for point in _points(tuple((place, _changed(place)) for place in sys.path))}
 

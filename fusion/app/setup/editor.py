@@ -27,12 +27,13 @@ from fusion.app.setup.form import (
     write_fields,
 )
 from fusion.app.setup.plan import FrameView, Placed, Plan, PlanView, RegionsView
-from fusion.app.setup.times import TimesView, recordings_of
+from fusion.app.setup.times import TimesView
 from fusion.campaign.columns import TableProposal
 from fusion.campaign.draft import Asker, separate_tests, write_campaigns
 from fusion.campaign.inspect import FolderContent, Kind, Recording, scan_folder
+from fusion.campaign.recordings import recordings_of
 from fusion.campaign.values import QuantityError, read_quantity
-from fusion.messages import BAD_INPUT
+from fusion.common.messages import BAD_INPUT
 from fusion.pipeline.check import CampaignCheck, check_campaign
 from interferometry.common import InterferometryError
 from thermography.common import ThermographyError

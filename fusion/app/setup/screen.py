@@ -10,7 +10,7 @@ import panel as pn
 
 from fusion.app import parts as ui
 from fusion.app.setup.folder import LARGEST_MB, found_in_folder, store_upload
-from fusion.messages import BAD_INPUT
+from fusion.common.messages import BAD_INPUT
 
 if TYPE_CHECKING:
     from fusion.app.setup.editor import CampaignEditor, Opened

@@ -17,7 +17,7 @@ import xarray as xr
 from fusion.analysis.drift_model.recursion import make_recursion
 from fusion.analysis.predicted_test import in_order, predict_values, scatter_and_drift
 from fusion.common import Array
-from fusion.messages import naming
+from fusion.common.messages import naming
 from fusion.report.exports import maps, tables
 from fusion.report.exports.controls import (
     CONTROLS,

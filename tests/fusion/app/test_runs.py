@@ -10,7 +10,7 @@ import pytest
 
 from fusion.app.parts import state_of
 from fusion.app.runs import RUNS, Progress, RunError, Runs, is_begun
-from fusion.messages import ExitCode
+from fusion.common.messages import ExitCode
 from fusion.pipeline.resume import noted_campaign
 from fusion.results.progress import write_lines
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fusion.common import FusionError
-from fusion.messages import naming
+from fusion.common.messages import naming
 from interferometry.common import InterferometryError
 from thermography.common import ThermographyError
 

@@ -13,7 +13,6 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.consistency.camera import (
-    Motion,
     file_warnings,
     find_gaps,
     gap_words,
@@ -22,6 +21,7 @@ from fusion.analysis.consistency.camera import (
 )
 from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.consistency.library import RULES
+from fusion.analysis.consistency.motion import Motion
 from fusion.pipeline.consistency import Check, _worded, run_checks
 from fusion.results.axis import RegistrationPart
 from tests.fusion.analysis.consistency.twin_fields import recorded

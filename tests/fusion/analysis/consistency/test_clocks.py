@@ -207,7 +207,7 @@ def test_a_log_that_shows_less_than_the_load_is_named_after_its_shape(load, word
 
 
 def in_words(kind: dict[str, object]) -> str:
-    return " ".join(sentences("kind_of_load", kind, template="checks.j2")) if kind else ""
+    return " ".join(sentences("kind_of_load", kind, template="consistency.j2")) if kind else ""
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ from fusion.analysis.effects import library as library_module
 from fusion.analysis.effects import plugins as module
 from fusion.analysis.effects.effect import Effect
 from fusion.analysis.effects.library import LIBRARY, describe_effect, library
-from fusion.analysis.effects.plugins import PluginError, describe_code, leave_plugins_out, load_plugin, plugins
+from fusion.analysis.effects.plugins import PluginError, describe_code, load_plugin, plugins
 from fusion.analysis.effects.thermal import quasi_static
+from fusion.common import NO_PLUGINS
 from fusion.results.parts import PluginPart
 from tests.fusion.small_campaign import campaign, logged
 
@@ -116,7 +117,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: machine-effects\nVersion: 1.4\n")
     (info / "entry_points.txt").write_text("[thermofuse.effects]\nbed_bending = machine_effects:bed\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delenv("THERMOFUSE_NO_PLUGINS", raising=False)
+    monkeypatch.delenv(NO_PLUGINS, raising=False)
     yield tmp_path
 
 
@@ -144,12 +145,9 @@ def test_the_code_of_a_plug_in_is_found_without_importing_it(installed: Path, mo
     assert of_none["code"] == [] and of_none["distribution"] == "unknown"
 
 
-def test_plugins_are_left_out_here_and_in_processes_started_from_here(
-    installed: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("THERMOFUSE_NO_PLUGINS", "")
+def test_plugins_are_left_out_where_the_environment_says_so(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert plugins()
-    leave_plugins_out()
+    monkeypatch.setenv(NO_PLUGINS, "1")
     assert plugins() == {} and "bed_bending" not in library()
 
 

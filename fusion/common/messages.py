@@ -27,7 +27,7 @@ from rich.markup import escape
 from rich.segment import Segment
 from rich.text import Text
 
-from fusion.common import FusionError, suggest
+from fusion.common import FusionError, suggest, versions
 from interferometry.common import InterferometryError
 from thermography.common import ACTING, ThermographyError
 
@@ -229,8 +229,6 @@ def reported(error: BaseException) -> str:
 
 def fault_report(error: BaseException) -> str:
     """Return what the authors need to find a fault of the program, and nothing that belongs to the user."""
-    from fusion.common import versions
-
     lines = ["Fault of thermofuse. This file holds versions and the stack, no value, message or path of yours.", ""]
     lines += [f"system: {platform.system()} {platform.machine()}"]
     lines += [f"{name}: {version}" for name, version in versions().items()]

@@ -1,76 +1,19 @@
-"""What the whole package shares: its error, the versions that a result depends on, and TOML files that a user writes; light to import."""
+"""TOML files that a user writes: read into tables, and their faults as sentences with line, key, value and remedy (pydantic finds them)."""
 
 from __future__ import annotations
 
-import difflib
 import json
-import platform
 import re
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
-from functools import cache
-from importlib import metadata
-from itertools import chain, count
-from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import TYPE_CHECKING, Any, TypeAlias, get_args, get_type_hints
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+from fusion.common import FusionError, suggest
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from pydantic_core import ErrorDetails
-
-Array: TypeAlias = "NDArray[np.float64]"
-
-#: The file that makes a folder a campaign, looked for where a folder is named.
-CAMPAIGN_FILE = "campaign.toml"
-
-#: Packages whose version can change a number in the results.
-_PACKAGES = (
-    "thermofuse", "numpy", "scipy", "xarray", "opencv-python-headless", "scikit-image", "numba", "imagecodecs", "OpenEXR",
-    "ref-index", "pandas", "h5netcdf", "netCDF4",
-)  # fmt: skip
-
-
-class FusionError(ValueError):
-    """Input that cannot be used; the message names the place, the value and the remedy.
-
-    Every error that this package raises about its input is a subclass, so that a caller recognises all of them by class.
-    """
-
-
-@cache
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of every package that takes part in the calculation."""
-    installed = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            installed[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            installed[name] = "not installed"
-    return installed
-
-
-def place_within(folder: Path, name: str) -> Path | None:
-    """Return the place of what a file names within a folder; None where the name leads out of it, on any system or by a symbolic link.
-
-    Names out of results, downloads and listings become paths here alone: whoever made the file may have meant other folders.
-    """
-    if "\0" in name or "\\" in name or PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive:
-        return None
-    path = folder / name
-    try:
-        return path if folder.resolve() in path.resolve().parents else None
-    except (OSError, RuntimeError, ValueError):  # A link to itself, a name that no system can hold.
-        return None
-
-
-def own_name(name: str, taken: Collection[str]) -> str:
-    """Return a name that is none of those taken: with a number behind it where names from a file make two alike."""
-    return next(one for one in chain([name], (f"{name} ({k})" for k in count(2))) if one not in taken)
-
-
-# TOML files that a user writes: read into tables, and their faults as sentences with line, key, value and remedy (pydantic finds them).
 
 #: From the path of a key to ``"FILE, line N"``.
 Place = Callable[[tuple[str, ...]], str]
@@ -132,12 +75,6 @@ def _whole_numbers(value: Any) -> Iterator[int]:
     elif isinstance(value, dict | list):
         for item in value.values() if isinstance(value, dict) else value:
             yield from _whole_numbers(item)
-
-
-def suggest(name: str, known: Iterable[str]) -> str:
-    """Return ``"did you mean X? "`` for the nearest known name, or nothing where none is near."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f"did you mean {near[0]}? " if near else ""
 
 
 def first_faults(faults: Iterable[str], path: Path | str) -> str:
