@@ -534,9 +534,15 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     in_first = cycle == cycle[0]
     since_first = _drift_from_state(joint, smoothed, _drift_at_state(joint, in_first / np.count_nonzero(in_first)))
     resolution_um = float(joint.readings["resolution"])
-    deletion = fit.deletion_residuals(ROUNDING * resolution_um)
-    scatter, freedom = _scatter(joint, smoothed, by_coefficients, deletion)
-    standardised = grid.per_reading(deletion)
+    if fit.system.memory is None:
+        of_noise, variance = (
+            fit.deletion_residuals(ROUNDING * resolution_um),
+            _deletion_variance(joint, smoothed, by_coefficients),
+        )
+    else:
+        of_noise, variance = _whole_noise(joint, smoothed, ROUNDING * resolution_um)
+    scatter, freedom = _scatter(joint, of_noise, *variance)
+    standardised = grid.per_reading(of_noise)
     standardised[grid.is_left_out(deviations)] = np.inf
     noise = fit.system.independent * smoothed.u[:, 0]
     excess = _excess_variance(scatter, freedom, joint) + _memory_variance(grid.per_reading(noise), joint)
@@ -627,25 +633,42 @@ def _reversal(cells: NDArray[np.int64], profile: Array, covariance: Array, targe
     return reversal, np.sqrt(np.maximum(variance, 0.0))
 
 
-def _scatter(joint: JointFit, smoothed: Smoothed, by_coefficients: Array, standardised: Array) -> tuple[Array, Array]:
-    """Return the random standard deviation of each cell (um) and its degrees of freedom."""
+def _deletion_variance(joint: JointFit, smoothed: Smoothed, by_coefficients: Array) -> tuple[Array, Array]:
+    """Return squares of the noise of every reading, um2, from what all others predict, and their degrees of freedom."""
     fit, D = joint.fit, smoothed.D
-    cells = len(joint.cells)
     expected = D - by_coefficients / fit.sigma**2
     with np.errstate(divide="ignore", invalid="ignore"):
         remaining = expected / D
-        deletion = smoothed.u[:, 0] / D
-        shared = fit.system.memory.share if fit.system.memory else 0.0
-        square = deletion**2 / remaining - fit.sigma**2 * (1.0 / D - fit.system.independent - shared)
+        square = (smoothed.u[:, 0] / D) ** 2 / remaining - fit.sigma**2 * (1.0 / D - fit.system.independent)
+    return square, np.where(remaining > 1e-6, remaining * np.minimum(D * fit.system.variance, 1.0), 0.0)
+
+
+def _whole_noise(joint: JointFit, smoothed: Smoothed, least_sigma: float) -> tuple[Array, tuple[Array, Array]]:
+    """Return the noise of every reading in standard deviations of an ordinary one, and its squares, um2, with their degrees of freedom: all
+    that the drift leaves. What neighbours predict where the noise has a memory depends on their scatter as well.
+    """
+    fit, loadings = joint.fit, joint.fit.system.loadings
+    noise = fit.residual() - np.einsum("nc,nc->n", loadings, smoothed.levels[:, :, 0])
+    unknown = np.einsum("nc,ncd,nd->n", loadings, smoothed.level_covariance, loadings)
+    # The profile takes the worth of one reading from every cell.
+    left = 1.0 - 1.0 / np.bincount(joint.cell)[joint.cell]
+    known = np.clip(1.0 - unknown, 1e-6, 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        standardised = noise / (max(fit.sigma, least_sigma) * np.sqrt(known * left))
+        square = noise**2 / left + fit.sigma**2 * unknown
+    return standardised, (square, left * known)
+
+
+def _scatter(joint: JointFit, standardised: Array, square: Array, worth: Array) -> tuple[Array, Array]:
+    """Return the random standard deviation of each cell (um) and its degrees of freedom from the squares of its readings' noise."""
+    cells = len(joint.cells)
     # Median absolute deviation from zero, the expectation of a residual, as a normal standard deviation.
     medians = [np.median(np.abs(standardised[joint.cell == cell])) for cell in range(cells)]
     typical = np.array(medians) / special.ndtri(0.75)
-    kept = (np.abs(standardised) <= OUTLIER_LIMIT * np.maximum(typical, 1.0)[joint.cell]) & (remaining > 1e-6)
+    kept = (np.abs(standardised) <= OUTLIER_LIMIT * np.maximum(typical, 1.0)[joint.cell]) & (worth > 0.0)
     count = np.bincount(joint.cell[kept], minlength=cells)
     squares = np.bincount(joint.cell[kept], square[kept], minlength=cells)
-    freedom = np.bincount(
-        joint.cell[kept], remaining[kept] * np.minimum(D * fit.system.variance, 1.0)[kept], minlength=cells
-    )
+    freedom = np.bincount(joint.cell[kept], worth[kept], minlength=cells)
     usable = freedom > 0.5
     variance = np.where(usable, np.maximum(squares, 0.0) / np.maximum(count, 1), np.nan)
     return np.sqrt(variance), np.where(usable, freedom, 0.0)

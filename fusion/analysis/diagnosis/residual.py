@@ -130,6 +130,8 @@ def examine(
     signs = np.array([1.0 if sites[k][1] == "positive" else -1.0 for k in kept])
     share_of = readings.positions_mm / readings.span_mm
     place = np.array([share_of[np.flatnonzero(readings.targets == sites[k][0])[0]] for k in kept])
+    if fit.system.memory is not None:
+        tested = _without_neighbours(tested, signs, place)
 
     shapes = _shapes(signs, place)
     # Cycles are shuffled within each site; missing readings move along.
@@ -175,6 +177,20 @@ def with_drift(remainder: Remainder, fit: DriftFit) -> Remainder:
         series=drift[:, largest],
         free=lambda columns: columns - basis @ (basis.T @ columns),
     )
+
+
+def _without_neighbours(matrix: Array, signs: Array, place: Array) -> Array:
+    """Take from every site (cycles, sites) its share of the one before in the pass: where the scatter of the sites differs, the memory that
+    all have in common leaves some, and permuted sites have none.
+    """
+    passes = [np.flatnonzero(signs == sign)[np.argsort(sign * place[signs == sign])] for sign in np.unique(signs)]
+    pairs = [(one[:-1], one[1:]) for one in passes]
+    before, here = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
+    filled = np.nan_to_num(matrix)
+    share = max(float((filled[:, before] * filled[:, here]).sum() / (filled[:, before] ** 2).sum()), 0.0)
+    matrix = matrix.copy()
+    matrix[:, here] = (matrix[:, here] - share * filled[:, before]) / np.sqrt(1.0 - min(share, 0.9) ** 2)
+    return matrix
 
 
 def _shapes(signs: Array, place: Array) -> tuple[Array, ...]:
