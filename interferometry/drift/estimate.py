@@ -540,7 +540,7 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
             _deletion_variance(joint, smoothed, by_coefficients),
         )
     else:
-        of_noise, variance = _whole_noise(joint, smoothed, ROUNDING * resolution_um)
+        of_noise, variance = _whole_noise(joint, ROUNDING * resolution_um)
     scatter, freedom = _scatter(joint, of_noise, *variance)
     standardised = grid.per_reading(of_noise)
     standardised[grid.is_left_out(deviations)] = np.inf
@@ -643,13 +643,12 @@ def _deletion_variance(joint: JointFit, smoothed: Smoothed, by_coefficients: Arr
     return square, np.where(remaining > 1e-6, remaining * np.minimum(D * fit.system.variance, 1.0), 0.0)
 
 
-def _whole_noise(joint: JointFit, smoothed: Smoothed, least_sigma: float) -> tuple[Array, tuple[Array, Array]]:
+def _whole_noise(joint: JointFit, least_sigma: float) -> tuple[Array, tuple[Array, Array]]:
     """Return the noise of every reading in standard deviations of an ordinary one, and its squares, um2, with their degrees of freedom: all
     that the drift leaves. What neighbours predict where the noise has a memory depends on their scatter as well.
     """
-    fit, loadings = joint.fit, joint.fit.system.loadings
-    noise = fit.residual() - np.einsum("nc,nc->n", loadings, smoothed.levels[:, :, 0])
-    unknown = np.einsum("nc,ncd,nd->n", loadings, smoothed.level_covariance, loadings)
+    fit = joint.fit
+    noise, unknown = fit.whole_noise()
     # The profile takes the worth of one reading from every cell.
     left = 1.0 - 1.0 / np.bincount(joint.cell)[joint.cell]
     known = np.clip(1.0 - unknown, 1e-6, 1.0)

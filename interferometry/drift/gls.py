@@ -180,6 +180,12 @@ class DriftFit:
         smoothed = self.system.smooth(self.residual()[:, None])
         return self.system.independent * smoothed.u[:, 0], self.system.independent**2 * smoothed.D
 
+    def whole_noise(self) -> tuple[Array, Array]:
+        """What the drift leaves of each reading, with what it shares with others (n,), and the variance of that drift in sigma^2 (n,)."""
+        loadings, smoothed = self.system.loadings, self.system.smooth(self.residual()[:, None])
+        drift = np.einsum("nc,nc->n", loadings, smoothed.levels[:, :, 0])
+        return self.residual() - drift, np.einsum("nc,ncd,nd->n", loadings, smoothed.level_covariance, loadings)
+
     def innovations(self) -> Array:
         """Each observed reading minus its prediction from those before it, in standard deviations of the prediction."""
         return np.asarray(self.system.whiten(self.residual()[:, None])[0][:, 0] / self.sigma)

@@ -120,9 +120,15 @@ def examine(
     set_aside: Collection[tuple[int, str]] = (),
 ) -> Remainder:
     """Test what the fit leaves for structure and describe the largest of it; ``memory`` is that of each site's noise over the cycles."""
-    cycles, numbers, matrix = readings.by_site(np.clip(fit.white_noise(), -4.0, 4.0))
+    # Where the noise has a memory, it is taken out below: what the model expects of a reading depends on the scatter of its neighbours.
+    noise = (
+        fit.whole_noise()[0] / (fit.sigma * np.sqrt(fit.system.variance)) if fit.system.memory else fit.white_noise()
+    )
+    cycles, numbers, matrix = readings.by_site(np.clip(noise, -4.0, 4.0))
     sites = [(int(readings.targets[k // 2]), "negative" if k % 2 else "positive") for k in numbers]
     kept = [k for k, site in enumerate(sites) if site not in set(set_aside)]
+    if fit.system.memory is not None:
+        matrix = _without_the_one_before(matrix, readings.by_site(readings.seconds)[2], fit.system.memory.time_s)
     tested = matrix[:, kept]
     tested = (tested - np.nanmean(tested, axis=0)) / np.maximum(np.nanstd(tested, axis=0), 1e-9)
     # Permuted cycles have no memory: noise that has one would pass for a pattern.
@@ -130,8 +136,6 @@ def examine(
     signs = np.array([1.0 if sites[k][1] == "positive" else -1.0 for k in kept])
     share_of = readings.positions_mm / readings.span_mm
     place = np.array([share_of[np.flatnonzero(readings.targets == sites[k][0])[0]] for k in kept])
-    if fit.system.memory is not None:
-        tested = _without_neighbours(tested, signs, place)
 
     shapes = _shapes(signs, place)
     # Cycles are shuffled within each site; missing readings move along.
@@ -179,18 +183,18 @@ def with_drift(remainder: Remainder, fit: DriftFit) -> Remainder:
     )
 
 
-def _without_neighbours(matrix: Array, signs: Array, place: Array) -> Array:
-    """Take from every site (cycles, sites) its share of the one before in the pass: where the scatter of the sites differs, the memory that
-    all have in common leaves some, and permuted sites have none.
-    """
-    passes = [np.flatnonzero(signs == sign)[np.argsort(sign * place[signs == sign])] for sign in np.unique(signs)]
-    pairs = [(one[:-1], one[1:]) for one in passes]
-    before, here = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
-    filled = np.nan_to_num(matrix)
-    share = max(float((filled[:, before] * filled[:, here]).sum() / (filled[:, before] ** 2).sum()), 0.0)
-    matrix = matrix.copy()
-    matrix[:, here] = (matrix[:, here] - share * filled[:, before]) / np.sqrt(1.0 - min(share, 0.9) ** 2)
-    return matrix
+def _without_the_one_before(matrix: Array, seconds: Array, memory_s: float) -> Array:
+    """Take from every reading (cycles, sites) its share of the one before in time, as permuted sites have none of it."""
+    order = np.argsort(np.nanmean(seconds - np.nanmin(seconds, axis=1, keepdims=True), axis=0))
+    relative = matrix / np.maximum(np.nanstd(matrix, axis=0), 1e-9)
+    series, at = relative[:, order].ravel(), seconds[:, order].ravel()
+    before, between = np.nan_to_num(series[:-1]), np.diff(at)
+    # From one pass or cycle to the next it takes longer.
+    before *= np.nan_to_num(np.minimum(np.exp((np.nanmedian(between) - between) / memory_s), 1.0))
+    share = float(np.clip(np.nansum(series[1:] * before) / (before @ before), 0.0, 0.9))
+    white = np.empty(relative.shape)
+    white[:, order] = np.r_[series[:1], series[1:] - share * before].reshape(relative.shape)
+    return white
 
 
 def _shapes(signs: Array, place: Array) -> tuple[Array, ...]:
