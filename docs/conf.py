@@ -36,6 +36,8 @@ extensions = [
     "sphinx.ext.mathjax",
     "reference_pages",
     "measured_files",
+    "drawings",
+    "finished_reports",
 ]
 exclude_patterns = ["reference/_generated"]
 if tags.has("few_modules"):  # noqa: F821 - Sphinx puts it there; `sphinx-build -t few_modules` is quick
