@@ -21,8 +21,8 @@ from tests.soak.simulator import Array, first_order, room, switched_load, walk
 pytestmark = pytest.mark.slow
 
 RUNS, FIRST_SEED = campaigns(6), first_seed(9000)
-#: Least and largest duration of an event, as shares of the longest that is looked for, and the share of it that happens at once; without
-#: one it is even, else what is left settles.
+#: Least and largest duration of an event, as shares of a thirtieth of the record or, below 1, of a day where that is less, and the share of
+#: it that happens at once; without one it is even, else what is left settles.
 KINDS = {
     "at once": (0.0, 0.0, None),
     "minutes": (0.02, 0.2, None),
@@ -30,16 +30,24 @@ KINDS = {
     "creep": (0.3, 1.0, 0.0),
     "settling": (0.1, 1.0, 0.5),
 }
-LARGE = 6.0  # From this size on, in standard deviations of a reading, an event is to be found.
+#: From this size on, in standard deviations of a reading and of what the channel wanders meanwhile, an event is to be found.
+LARGE = 6.0
+LONG = {"long": (1.0, 7.5, None), "long creep": (1.0, 7.5, 0.0)}
 
 
 @dataclass(frozen=True)
 class Happened:
-    """An event: when it began and how long it took, s, and its size in every channel, um."""
+    """An event: when it began and how long it took, s, its size in every channel, and how far these wander meanwhile, um."""
 
     onset_s: float
     duration_s: float
     size: Array
+    wander_um: float
+
+    @property
+    def is_large(self) -> bool:
+        """Whether it is to be found."""
+        return float(np.abs(self.size).max()) >= LARGE * float(np.hypot(1.0, self.wander_um))
 
 
 def simulated(rng: np.random.Generator, kinds: list[str], *, everywhere: bool) -> tuple[xr.Dataset, list[Happened]]:
@@ -60,23 +68,27 @@ def simulated(rng: np.random.Generator, kinds: list[str], *, everywhere: bool) -
 
     temperature = [late(rng.uniform(0.0, 1.0, 3), rng.uniform(0.2, 10.0)) for _ in range(int(rng.integers(2, 6)))]
     response = [late(rng.normal(0.0, 2.0, 3), rng.uniform(2.0, 60.0)) for _ in range(channels)]
-    common = rng.uniform(0.0, 1.0) * walk(rng, seconds, wander)
+    in_common = rng.uniform(0.0, 1.0)
+    common = in_common * walk(rng, seconds, wander)
     steps = 0.5 * wander * np.sqrt(hours / readings) * rng.standard_t(4, (readings, channels))
     displacement = np.column_stack([one + common + walk(rng, seconds, wander) for one in response])
     displacement += np.cumsum(steps, axis=0) + rng.standard_normal((readings, channels))
     happened: list[Happened] = []
     for number, kind in enumerate(kinds):
-        least, largest, at_once = KINDS[kind]
-        duration_s = rng.uniform(least, largest) * min(86_400.0, seconds[-1] / 30.0)
+        least, largest, at_once = {**KINDS, **LONG}[kind]
+        duration_s = rng.uniform(least, largest) * min(np.inf if kind in LONG else 86_400.0, seconds[-1] / 30.0)
         # Each in a part of its own of the time before the hold-out.
-        onset_s = seconds[-1] * (0.1 + 0.6 * (number + rng.uniform(0.1, 0.8)) / len(kinds))
+        room_s = 0.7 * seconds[-1] - duration_s if kind in LONG else 0.6 * seconds[-1]
+        onset_s = 0.1 * seconds[-1] + room_s * (number + rng.uniform(0.1, 0.8)) / len(kinds)
         after = np.maximum(seconds - onset_s, 0.0) / max(duration_s, 1e-9)
         course = np.minimum(after, 1.0) if at_once is None else 1.0 - (1.0 - at_once) * np.exp(-3.0 * after)
         size, which = np.zeros(channels), rng.permutation(channels)[: channels if everywhere else rng.integers(1, 3)]
         size[which] = np.exp(rng.uniform(np.log(2.0), np.log(20.0))) * rng.choice([-1.0, 1.0])
         size[which] *= rng.uniform(0.7, 1.3, which.size)
         displacement += np.where(seconds >= onset_s, course, 0.0)[:, None] * size
-        happened.append(Happened(onset_s, duration_s, size))
+        # Steps of Student's t with 4 degrees of freedom have twice the variance.
+        moves = wander * np.sqrt((1.0 + in_common**2 + 0.5) * duration_s / 3600.0)
+        happened.append(Happened(onset_s, duration_s, size, float(moves)))
     logged = 20.0 + np.column_stack(temperature) + 0.02 * rng.standard_normal((readings, len(temperature)))
     return table_of(displacement, logged, load if load.any() else None, step_s=float(seconds[1])), happened
 
@@ -96,7 +108,7 @@ def is_of(event: Event, one: Happened, step_s: float) -> bool:
 
 def test_events_are_found_dated_and_sized_and_none_is_where_nothing_happens(capsys: pytest.CaptureFixture[str]) -> None:
     large, dated, lasted, sized, false = ([] for _ in range(5))
-    for number, kind in enumerate(("none", *KINDS, "in all channels", "several")):
+    for number, kind in enumerate(("none", *KINDS, "in all channels", "several", *LONG)):
         for seed in range(FIRST_SEED, FIRST_SEED + RUNS):
             rng = np.random.default_rng([seed, number])
             several = [str(one) for one in rng.choice([*KINDS], int(rng.integers(2, 4)))]
@@ -105,7 +117,7 @@ def test_events_are_found_dated_and_sized_and_none_is_where_nothing_happens(caps
             step_s, left = float(np.diff(table["time"].values[:2])[0] / np.timedelta64(1, "s")), events(table)
             for one in happened:
                 found = next((event for event in left if is_of(event, one, step_s)), None)
-                large += [found is not None] if np.abs(one.size).max() >= LARGE else []
+                large += [found is not None] if one.is_large else []
                 if found is not None:
                     left = [event for event in left if event is not found]
                     dated.append(found.onset.low <= one.onset_s <= found.onset.high)

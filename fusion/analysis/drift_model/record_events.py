@@ -1,13 +1,16 @@
 """Events of a record: slips, creeps and settlings, dated and sized in the raw readings of every channel before any mean is taken.
 
-The readings after an instant are compared with those before it, over windows of all lengths, beside what temperatures and loads do over
-the same windows. An event is a change that is out of proportion to all others of its channel: docs/method/records.md.
+The readings after an instant are compared with those before it, over short windows of all lengths, beside what temperatures and loads do
+over the same windows: an event is a change that is out of proportion to all others of its channel. What takes longer is looked for over the
+whole record by the likelihood under noise and drifts of all sizes: docs/method/records.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from functools import cached_property
+from itertools import product
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,6 +19,7 @@ from scipy import linalg, optimize
 
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.drift_model.evaluation import Answer
+from fusion.analysis.drift_model.null_simulation import DRAWS, tail_probability
 from fusion.analysis.drift_model.record_data import Record, Samples
 from fusion.analysis.drift_model.search import Decision, Reason
 from fusion.analysis.effects.effect import Candidate
@@ -28,7 +32,7 @@ _MOST_CELLS = 20_000
 #: Shortest window in cells, and the longest as a share of the record, which must hold many of them.
 _SHORTEST, _LONGEST_SHARE = 4, 1.0 / 24.0
 #: Time constants of the lagged copies of temperatures and loads, as shares of the record.
-_LAG_SHARES = (1.0 / 1000.0, 1.0 / 250.0, 1.0 / 60.0)
+_LAG_SHARES = (1.0 / 1000.0, 1.0 / 250.0, 1.0 / 60.0, 1.0 / 15.0)
 #: Windows per column of the regression on these, rows that it is made from at most, and the excursion that counts in full (Huber).
 _PER_COLUMN, _ROWS, _HUBER = 8, 1500, 1.345
 #: The largest excursions say nothing of the others, as they may be events: their share and least number.
@@ -39,6 +43,15 @@ _UNUSUAL, _SELDOM = 4.0, 0.02
 #: Points of a closer look, and how long a change may take, as shares of it.
 _POINTS = 160
 _DURATIONS = (0.0, 0.02, 0.035, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45)
+#: Points of a whole run, fewest that are looked at, durations of slow changes as shares of it, and time between onsets as a share of these.
+_SLOW_POINTS, _SLOW_LEAST, _SLOW_ONSETS = 96, 48, 1.0 / 6.0
+_SLOW_DURATIONS = tuple(np.geomspace(1.0 / 24.0, 0.36, 7).tolist())
+#: Variances of the steps of a random walk, and of the steps of the rate of a smooth drift, from point to point, beside the noise of one.
+_WALKS, _SMOOTH = (0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0), (0.0, 1e-5, 1e-3, 1e-2)
+#: Of a closer look at a slow change: how far its onset and by what factor its duration may be another, and how many are tried.
+_AROUND, _FACTORS, _ONSETS = 1.2, np.geomspace(0.4, 2.5, 13), 48
+#: A slow change belongs to a temperature or load that gains so many times as much by a change then as by any other.
+_MORE = 2.0
 #: Log-likelihood by which the best may beat what a 95 % interval still holds, and that a course of two parts must gain.
 _WITHIN, _SECOND_PART = 1.92, 3.0
 #: Standard uncertainties from which on a channel takes part in an event that another shows.
@@ -122,13 +135,17 @@ class Event(Candidate):
 
 
 class _Seen(NamedTuple):
-    """The change that is most out of proportion: its window begins at cell `at`, lasts `gap` cells between means of `mean` cells."""
+    """The change that is most out of proportion: its window begins at cell `at`, lasts `gap` cells between means of `mean` cells; of a slow
+    one its course, and the whole run on points.
+    """
 
     log_p: float
     at: int
     gap: int
     mean: int
     channel: int
+    course: Course | None = None
+    run: _Run | None = None
 
 
 def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], list[Decision]]:
@@ -140,7 +157,7 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
     cells, found, decisions = _Cells.of(samples, inside), list[Event](), list[Decision]()
     if cells is None:
         return [], []
-    while (seen := cells.most_striking()) is not None:
+    while (seen := cells.most_striking() or cells.most_likely()) is not None:
         if load := cells.load_that_changes(seen):
             evidence: dict[str, float | str] = {"name": load, "hours": float(cells.seconds[seen.at]) / 3600.0}
             decisions.append(Decision("step_event", Reason.WITH_A_LOAD, evidence))
@@ -184,6 +201,7 @@ class _Cells:
     names : of the temperatures and loads
     excursions, slopes : by gap and length of the means, in robust standard deviations of each channel, and of the columns in um per unit
     changed : channels for which these have to be computed again
+    runs : those that are long enough for slow changes, and what was found in each channel of them
     """
 
     seconds: Array
@@ -194,6 +212,7 @@ class _Cells:
     excursions: dict[tuple[int, int], Array] = field(default_factory=dict)
     slopes: dict[tuple[int, int], Array] = field(default_factory=dict)
     changed: dict[tuple[int, int], set[int]] = field(default_factory=dict)
+    runs: list[_Run] = field(default_factory=list)
 
     @classmethod
     def of(cls, samples: Samples, used: NDArray[np.bool_]) -> _Cells | None:
@@ -224,8 +243,12 @@ class _Cells:
             late = [respond(moved, seconds, time_constant_s=share * span) for share in _LAG_SHARES]
             laid = np.column_stack([seconds, response, moved, *late])
             parts.append(np.pad(laid, ((0, apart), (0, 0)), constant_values=np.nan))
+        ends = np.cumsum([len(one) for one in parts]) - apart
         laid, channels = np.concatenate(parts), 1 + samples.displacement.shape[1]
-        return cls(laid[:, 0], step, laid[:, 1:channels], laid[:, channels:], samples.names)
+        cells = cls(laid[:, 0], step, laid[:, 1:channels], laid[:, channels:], samples.names)
+        first = ends - [len(one) - apart for one in parts]
+        cells.runs += [_Run(cells, *ends) for ends in zip(first, ends, strict=True) if ends[1] - ends[0] >= _SLOW_LEAST]
+        return cells
 
     def windows(self) -> list[tuple[int, int]]:
         """Gaps and lengths of the means on either side, in cells: changes at once and changes that take as long as the window."""
@@ -247,6 +270,12 @@ class _Cells:
                     one = int(np.nanargmax(np.abs(scaled[at]))) if number == channels else number
                     best = _Seen(log_p, at + mean, gap, mean, one)
         return best
+
+    def most_likely(self) -> _Seen | None:
+        """The slow change whose probability among all courses, runs and channels is least, where it is small enough for an event."""
+        seen = [one for run in self.runs for one in run.slow_changes()]
+        least = min(seen, key=lambda one: one.log_p, default=None)
+        return None if least is None or least.log_p >= np.log(RECORD_ENTRY_LEVEL / len(seen)) else least
 
     def scaled(self, gap: int, mean: int) -> Array:
         """Changes over a window beside those of temperatures and loads, in robust standard deviations of their channel."""
@@ -279,6 +308,8 @@ class _Cells:
 
     def load_that_changes(self, seen: _Seen) -> str:
         """A temperature or load that changes over the window of an event as at hardly any other time; empty where none does."""
+        if seen.run is not None:
+            return seen.run.load_that_changes(seen)
         moved = np.abs(_changes(self.moved[:, : len(self.names)], seen.gap, seen.mean))
         here = moved[seen.at - seen.mean]
         for name, all_of_it, own in zip(self.names, moved[np.isfinite(moved[:, 0])].T, here, strict=True):
@@ -289,18 +320,21 @@ class _Cells:
 
     def ignore(self, seen: _Seen, channels: slice | int) -> None:
         """Leave the window of a change out of every later look at its channel, or at all of them."""
+        if seen.run is not None:
+            seen.run.ignore(seen, channels)
+            return
         first, last = seen.at - seen.mean, seen.at + seen.gap + seen.mean
         for (gap, mean), scaled in self.excursions.items():
             scaled[max(0, first - gap - mean) : max(0, last + 1), channels] = np.nan
 
     def closer(self, seen: _Seen, digits: Array) -> Event | None:
         """Onset, duration and size of a change by the likelihood of the readings around it; None where these show none."""
+        if seen.run is not None:
+            looked, shown = seen.run.look(seen)
+            return looked.event(seen, digits, shown)
         left = self.response - self.moved @ self.slopes[seen.gap, seen.mean]
-        half, longest, looks = (
-            3 * max(seen.gap, seen.mean, 2 * _SHORTEST),
-            left.shape[0] // 8,
-            list[tuple[_Look, Course, Array, Array]](),
-        )
+        half, longest = 3 * max(seen.gap, seen.mean, 2 * _SHORTEST), left.shape[0] // 8
+        looks = list[tuple[_Look, Course, Array, Array]]()
         # A longer look shows whether more of the change follows; where it does not, the shorter one dates it better.
         while True:
             if (looked := _Look.at(self, left, seen, half)) is None:
@@ -313,31 +347,7 @@ class _Cells:
                 break
             if half > longest and len(looks) > 1:
                 break
-        looked, best, size, u = looks[-1]
-        part = np.abs(size) > _TAKES_PART * u
-        part &= np.abs(size) > digits
-        if not part[seen.channel]:
-            return None
-        channels = list(np.flatnonzero(part))
-        best = looked.best(channels)
-        size, u = looked.sizes(best)
-        onset, duration, u_course = looked.intervals(best, channels)
-        # What began before the first onset that was tried has no onset here.
-        if onset.low <= looked.courses[0].onset_s:
-            return None
-        return Event(
-            columns=np.empty((0, 1)),
-            parameters={"time_s": onset.value, "duration_min": duration.value / 60.0, "course": best.words},
-            units=("um",),
-            event_s=onset.value,
-            course=best,
-            onset=onset,
-            duration=duration,
-            size=np.where(part, size, 0.0),
-            size_u=np.where(part, np.hypot(u, u_course), 0.0),
-            p_value=min(1.0, float(np.exp(seen.log_p))),
-            answer=looked.answer(best, seen.channel),
-        )
+        return looks[-1][0].event(seen, digits)
 
     def take_out(self, event: Event) -> None:
         """Go on without an event."""
@@ -352,6 +362,218 @@ class _Cells:
     def _compute_again(self, channels: NDArray[np.bool_]) -> None:
         for window in self.changed:
             self.changed[window] |= set(np.flatnonzero(channels).tolist())
+        for run in self.runs:
+            run.forget(channels)
+
+
+class _Drift(NamedTuple):
+    """Noise and drift on some points: covariance, its root, what is beside the courses, how far both spread (logarithm), and the courses
+    without it, of unit length.
+    """
+
+    covariance: Array
+    root: Array
+    basis: Array
+    log_spread: float
+    courses: Array
+
+
+class _Likely(NamedTuple):
+    """Gain in profile log-likelihood by the best course of every response (n,), places of that and of the drifts with and without it."""
+
+    gain: Array
+    course: NDArray[np.intp]
+    drift: NDArray[np.intp]
+    without: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Courses that a response may have on some points beside columns (points, p), under noise and drifts of many sizes."""
+
+    courses: list[Course]
+    drifts: list[_Drift]
+    freedom: int
+
+    @classmethod
+    def of(cls, instants: Array, rows: NDArray[np.intp], beside: Array, courses: list[Course]) -> _Trial:
+        """Courses on those rows of points whose cells have instants (points, cells), s."""
+        laid = _laid(courses, instants[rows])
+        # Places from 1 on: a drift that begins with the first point is level there.
+        least, most = (one(rows[:, None], rows) + 1.0 for one in (np.minimum, np.maximum))
+        smooth, drifts = least**2 * (3.0 * most - least) / 6.0, []
+        for walk, rate in product(_WALKS, _SMOOTH):
+            covariance = np.eye(rows.size) + walk * least + rate * smooth
+            root = np.asarray(linalg.cholesky(covariance, lower=True))
+            basis, triangle = np.linalg.qr(linalg.solve_triangular(root, beside[rows], lower=True))
+            spread = 2.0 * float(np.log(np.abs(np.r_[np.diag(root), np.diag(triangle)])).sum())
+            freed = _freed(root, basis, laid)
+            freed /= np.linalg.norm(freed, axis=0) + 1e-9
+            drifts.append(_Drift(covariance, root, basis, spread, freed))
+        return cls(courses, drifts, rows.size - beside.shape[1])
+
+    @cached_property
+    def times(self) -> Array:
+        """Begin and end of every course (2, courses), s."""
+        return np.array([(one.onset_s, one.onset_s + one.duration_s) for one in self.courses]).T
+
+    def likely(self, responses: Array, tried: NDArray[np.bool_] | slice = slice(None)) -> _Likely:
+        """What the best of the tried courses gains in each of the responses (points, n), the size of all noise and drift free."""
+        number = responses.shape[1]
+        with_one, without = np.full((2, number), -np.inf)
+        course, drift, drift_without = np.zeros((3, number), np.intp)
+        places = np.arange(len(self.courses))[tried]
+        for place, one in enumerate(self.drifts):
+            left = _freed(one.root, one.basis, responses)
+            square = np.einsum("ij,ij->j", left, left)
+            explained = (one.courses[:, places].T @ left) ** 2
+            best = explained.argmax(axis=0)
+            rest = np.maximum(square - explained[best, np.arange(number)], 1e-12 * square) + np.finfo(float).tiny
+            both = [
+                -0.5 * (one.log_spread + self.freedom * np.log(each)) for each in (rest, square + np.finfo(float).tiny)
+            ]
+            better, better_without = both[0] > with_one, both[1] > without
+            with_one[better], course[better], drift[better] = both[0][better], places[best[better]], place
+            without[better_without], drift_without[better_without] = both[1][better_without], place
+        return _Likely(with_one - without, course, drift, drift_without)
+
+    @cached_property
+    def _nulls(self) -> dict[int, Array]:
+        return {}
+
+    def p_value(self, gain: float, drift: int) -> float:
+        """Probability of such a gain in a record of noise and this drift alone."""
+        if drift not in self._nulls:
+            root = self.drifts[drift].root
+            drawn = np.random.default_rng(0).standard_normal((root.shape[0], DRAWS))
+            self._nulls[drift] = self.likely(root @ drawn).gain
+        return tail_probability(gain, self._nulls[drift])
+
+
+class _Run:
+    """A run of a record on points, on which changes are looked for that take longer than any window."""
+
+    def __init__(self, cells: _Cells, first: int, end: int) -> None:
+        self.cells = cells
+        group = max(1, -(-(end - first) // _SLOW_POINTS))
+        self.here, self.number = slice(first, first + (end - first) // group * group), (end - first) // group
+        self.instants = cells.seconds[self.here].reshape(self.number, group)
+        self.moved = cells.moved[self.here].reshape(self.number, group, -1).mean(axis=1)
+        centred = self.moved - self.moved.mean(axis=0)
+        self.beside = np.column_stack([np.ones(self.number), centred @ _leading(centred, self.number)])
+        self.ignored: dict[int, list[tuple[float, float]]] = {}
+        self.found: dict[int, _Seen] = {}
+        self.trials: dict[bytes, _Trial] = {}
+
+    @property
+    def span_s(self) -> float:
+        """Time from the first to the last point."""
+        return float(np.ptp(self.instants))
+
+    def response(self) -> Array:
+        """Displacements of every channel (points, channels), um."""
+        values = self.cells.response[self.here].reshape(*self.instants.shape, -1)
+        known = np.isfinite(values)
+        count = known.sum(axis=1)
+        return np.where(2 * count >= self.instants.shape[1], np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
+
+    def slow_changes(self) -> list[_Seen]:
+        """The most likely slow change of every channel."""
+        for channel, response in enumerate(self.response().T):
+            rows = np.flatnonzero(np.isfinite(response))
+            if channel in self.found or rows.size < _SLOW_LEAST:
+                continue
+            trial = self._trial(rows, self.beside)
+            begin, end = trial.times
+            tried = np.ones(begin.size, bool)
+            for first, last in self.ignored.get(channel, []):
+                tried &= (end <= first) | (begin >= last)
+            if not tried.any():
+                continue
+            found = _Likely(*(one[0] for one in trial.likely(response[rows, None], tried)))
+            course = trial.courses[found.course]
+            log_p = float(np.log(trial.p_value(float(found.gain), int(found.without))))
+            self.found[channel] = _Seen(log_p, 0, 0, 0, channel, course, self)
+        return list(self.found.values())
+
+    def _trial(self, rows: NDArray[np.intp], beside: Array) -> _Trial:
+        if (key := rows.tobytes() + beside.tobytes()) not in self.trials:
+            middle, courses = self.instants.mean(axis=1), []
+            for duration in (share * self.span_s for share in _SLOW_DURATIONS):
+                onsets = np.arange(
+                    middle[2], middle[-3] - duration, max(_SLOW_ONSETS * duration, self.span_s / self.number)
+                )
+                courses += [Course(float(onset), duration, settles) for onset in onsets for settles in (False, True)]
+            self.trials[key] = _Trial.of(self.instants, rows, beside, courses)
+        return self.trials[key]
+
+    def near(self, course: Course) -> list[Course]:
+        """Courses like one, and changes at once."""
+        middle, duration = self.instants.mean(axis=1), course.duration_s
+        first, last = course.onset_s - _AROUND * duration, course.onset_s + _AROUND * duration
+        onsets = np.linspace(max(first, middle[1]), min(last, middle[-3]), _ONSETS)
+        shapes = ((False, 0.0), (True, 0.0), (True, 0.5))
+        return [
+            one
+            for onset in onsets.tolist()
+            for one in (
+                Course(onset, 0.0),
+                *(Course(onset, duration * factor, *shape) for shape in shapes for factor in _FACTORS.tolist()),
+            )
+        ]
+
+    def look(self, seen: _Seen) -> tuple[_Look, NDArray[np.bool_]]:
+        """The points of the run, with courses near that of a slow change, each channel under the drift that suits it best then, and the
+        channels (channels,) that show it by themselves.
+        """
+        assert seen.course is not None
+        response, covariances = self.response(), list[Array]()
+        shown = np.zeros(response.shape[1], bool)
+        for values in response.T:
+            rows = np.flatnonzero(np.isfinite(values))
+            covariance = np.eye(self.number)
+            if rows.size >= _SLOW_LEAST:
+                trial = self._trial(rows, self.beside)
+                found = trial.likely(values[rows, None], np.array([one == seen.course for one in trial.courses]))
+                shown[len(covariances)] = (
+                    trial.p_value(float(found.gain[0]), int(found.without[0])) < RECORD_ENTRY_LEVEL
+                )
+                drift = trial.drifts[int(found.drift[0])]
+                left = _freed(drift.root, drift.basis, values[rows, None])[:, 0]
+                left -= drift.courses[:, found.course[0]] * float(drift.courses[:, found.course[0]] @ left)
+                covariance[np.ix_(rows, rows)] = drift.covariance * float(left @ left) / (trial.freedom - 1)
+            covariances.append(covariance)
+        return _Look.of(self.instants, response, covariances, self.near(seen.course), self.beside), shown
+
+    def load_that_changes(self, seen: _Seen) -> str:
+        """A temperature or load that changes during a slow change as at no other time; empty where none does."""
+        assert seen.course is not None
+        names, every = self.cells.names, np.arange(self.number)
+        trial = self._trial(every, np.ones((self.number, 1)))
+        begin, end = trial.times
+        apart = (end <= seen.course.onset_s) | (begin >= seen.course.onset_s + seen.course.duration_s)
+        responses = self.moved[:, : len(names)]
+        here, elsewhere = (trial.likely(responses, tried) for tried in (~apart, apart))
+        for name, gain, other, drift in zip(names, here.gain, elsewhere.gain, here.without, strict=True):
+            if gain > _MORE * other and trial.p_value(float(gain), int(drift)) * len(names) < RECORD_ENTRY_LEVEL:
+                return name
+        return ""
+
+    def ignore(self, seen: _Seen, channels: slice | int) -> None:
+        """Leave the time of a slow change out of every later look at its channel, or at all of them."""
+        assert seen.course is not None
+        for channel in (
+            np.arange(self.cells.response.shape[1])[channels].ravel() if isinstance(channels, slice) else [channels]
+        ):
+            self.ignored.setdefault(int(channel), []).append(
+                (seen.course.onset_s, seen.course.onset_s + seen.course.duration_s)
+            )
+            self.found.pop(int(channel), None)
+
+    def forget(self, channels: NDArray[np.bool_]) -> None:
+        """Look again at some channels, which have changed."""
+        for channel in np.flatnonzero(channels):
+            self.found.pop(int(channel), None)
 
 
 @dataclass(frozen=True)
@@ -365,7 +587,7 @@ class _Look:
     gain : (courses, channels) in log-likelihood beside a level, under noise and a random walk of the channel's own size
     size : (courses, channels) um, of the whole change
     parts : (courses, channels) share of it that happened at once
-    whitened : of every channel the points that it has, their covariance, um², and the readings, um
+    whitened : of every channel the points that it has, their covariance, um², the readings, um, and the columns beside the change
     """
 
     seconds: Array
@@ -375,7 +597,7 @@ class _Look:
     gain: Array
     size: Array
     parts: Array
-    whitened: list[tuple[NDArray[np.intp], Array, Array]]
+    whitened: list[tuple[NDArray[np.intp], Array, Array, Array]]
 
     @classmethod
     def at(cls, cells: _Cells, left: Array, seen: _Seen, half: int) -> _Look | None:
@@ -407,22 +629,31 @@ class _Look:
             for share in _DURATIONS
             if share * width >= 2.0 * spacing or not (share or settles)
         ]
-        columns = np.column_stack([one.at(seconds.ravel()).reshape(number, group).mean(axis=1) for one in courses])
+        places, covariances = np.arange(number), []
+        for channel in left.T:
+            noise, walk = _noise_and_walk(channel, 2 * half)
+            covariances.append(walk * group * np.minimum(places[:, None], places) + noise / group * np.eye(number))
+        return cls.of(seconds, values, covariances, courses, np.ones((number, 1)))
+
+    @classmethod
+    def of(cls, seconds: Array, values: Array, covariances: list[Array], courses: list[Course], beside: Array) -> _Look:
+        """Look at values (points, channels), whose cells have times (points, cells), beside columns (points, p)."""
+        columns = _laid(courses, seconds)
         # Every onset stands for a change at once as well.
-        steps = columns[:, [not one.duration_s for one in courses]]
-        place = np.searchsorted(onsets, [one.onset_s for one in courses])
+        is_step = np.array([not one.duration_s for one in courses])
+        steps, onsets = columns[:, is_step], np.array([one.onset_s for one in courses])
+        place = np.searchsorted(onsets[is_step], onsets)
         two = np.array([one.at_once > 0.0 for one in courses])
         gain, size, parts = (np.zeros((len(courses), values.shape[1])) for _ in range(3))
         whitened = []
         for k, response in enumerate(values.T):
             rows = np.flatnonzero(np.isfinite(response))
-            noise, walk = _noise_and_walk(left[:, k], 2 * half)
-            covariance = walk * group * np.minimum(rows[:, None], rows) + noise / group * np.eye(rows.size)
-            whitened.append((rows, covariance, response[rows]))
+            covariance = covariances[k][np.ix_(rows, rows)]
+            whitened.append((rows, covariance, response[rows], beside[rows]))
             if rows.size < _LEAST_POINTS:
                 continue
             root: Array = np.asarray(np.linalg.cholesky(covariance), float)
-            y, x, s = (_beside_a_level(root, each[rows]) for each in (response[:, None], columns, steps))
+            y, x, s = (_without(root, beside[rows], each[rows]) for each in (response[:, None], columns, steps))
             y = y[:, 0]
             own = np.einsum("ij,ij->j", x, x) + 1e-12
             size[:, k] = x.T @ y / own
@@ -438,9 +669,39 @@ class _Look:
             is_one_change = (parts[two, k] > 0.05) & (parts[two, k] < 0.95)
             size[two, k] = both
             gain[two, k] = np.where(is_one_change, 0.5 * (first_part * u + second * v), -np.inf)
-            misfit = (y @ y - 2.0 * gain[:, k].max()) / max(1, rows.size - 4)
+            misfit = (y @ y - 2.0 * gain[:, k].max()) / max(1, rows.size - 3 - beside.shape[1])
             gain[:, k] /= max(1.0, misfit)
-        return cls(seconds.mean(axis=1), seconds, spacing, courses, gain, size, parts, whitened)
+        middle = seconds.mean(axis=1)
+        return cls(middle, seconds, float(np.median(np.diff(middle))), courses, gain, size, parts, whitened)
+
+    def event(self, seen: _Seen, digits: Array, shown: NDArray[np.bool_] | Literal[True] = True) -> Event | None:
+        """Onset, duration and size of a change in the channels that show it, out of some; None where that which shows it most does not, or
+        where it has no onset here.
+        """
+        size, u = self.sizes(self.best([seen.channel]))
+        part = (np.abs(size) > _TAKES_PART * u) & (np.abs(size) > digits) & shown
+        if not part[seen.channel]:
+            return None
+        channels = list(np.flatnonzero(part))
+        best = self.best(channels)
+        size, u = self.sizes(best)
+        onset, duration, u_course = self.intervals(best, channels)
+        # What began before the first onset that was tried has no onset here.
+        if onset.low <= self.courses[0].onset_s:
+            return None
+        return Event(
+            columns=np.empty((0, 1)),
+            parameters={"time_s": onset.value, "duration_min": duration.value / 60.0, "course": best.words},
+            units=("um",),
+            event_s=onset.value,
+            course=best,
+            onset=onset,
+            duration=duration,
+            size=np.where(part, size, 0.0),
+            size_u=np.where(part, np.hypot(u, u_course), 0.0),
+            p_value=min(1.0, float(np.exp(seen.log_p))),
+            answer=self.answer(best, seen.channel),
+        )
 
     def best(self, channels: list[int]) -> Course:
         """The course that fits these channels best, with the share at once that the one which shows it most has."""
@@ -456,15 +717,15 @@ class _Look:
         """Size of a course in every channel by these points, and its standard uncertainty, um; infinite where they are too few."""
         size, u = np.zeros(len(self.whitened)), np.full(len(self.whitened), np.inf)
         shares = course.at(self.instants.ravel()).reshape(self.instants.shape).mean(axis=1)
-        for k, (rows, covariance, response) in enumerate(self.whitened):
+        for k, (rows, covariance, response, beside) in enumerate(self.whitened):
             some = np.arange(rows.size)[every]
-            if some.size < _LEAST_POINTS:
+            if some.size < _LEAST_POINTS + beside.shape[1] - 1:
                 continue
             root = np.linalg.cholesky(covariance[np.ix_(some, some)])
-            y, x = (_beside_a_level(root, each[:, None])[:, 0] for each in (response[some], shares[rows[some]]))
+            y, x = (_without(root, beside[some], each[:, None])[:, 0] for each in (response[some], shares[rows[some]]))
             own = float(x @ x)
             size[k] = float(x @ y) / max(own, 1e-12)
-            misfit = float(((y - size[k] * x) ** 2).sum()) / (some.size - 2)
+            misfit = float(((y - size[k] * x) ** 2).sum()) / (some.size - 1 - beside.shape[1])
             u[k] = np.sqrt(max(1.0, misfit) / own) if own > 1e-9 else np.inf
         return size, u
 
@@ -583,9 +844,18 @@ def _noise_and_walk(values: Array, longest: int) -> tuple[float, float]:
     return max(float(noise), least), max(float(walk), least / longest)
 
 
-def _beside_a_level(root: Array, columns: Array) -> Array:
-    """Columns (points, n) whitened by the root of their covariance, without a level."""
-    number = columns.shape[0]
-    laid = linalg.solve_triangular(root, np.column_stack([np.ones(number), columns]), lower=True)
-    basis = laid[:, :1] / np.linalg.norm(laid[:, :1])
-    return np.asarray(laid[:, 1:] - basis @ (basis.T @ laid[:, 1:]))
+def _without(root: Array, beside: Array, columns: Array) -> Array:
+    """Columns (points, n) whitened by the root of their covariance, without what others (points, p) explain of them."""
+    basis = np.linalg.qr(linalg.solve_triangular(root, beside, lower=True))[0]
+    return _freed(root, basis, columns)
+
+
+def _freed(root: Array, basis: Array, columns: Array) -> Array:
+    """Columns (points, n) whitened by the root of their covariance, without what an orthonormal basis (points, p) explains of them."""
+    laid = linalg.solve_triangular(root, columns, lower=True)
+    return np.asarray(laid - basis @ (basis.T @ laid))
+
+
+def _laid(courses: list[Course], instants: Array) -> Array:
+    """Shares of every course on points whose cells have instants (points, cells), s (points, courses)."""
+    return np.column_stack([one.at(instants.ravel()).reshape(instants.shape).mean(axis=1) for one in courses])
