@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import linalg, optimize
+from scipy import linalg, optimize, stats
 
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.drift_model.evaluation import Answer
@@ -23,7 +23,7 @@ from fusion.analysis.drift_model.null_simulation import DRAWS, tail_probability
 from fusion.analysis.drift_model.record_data import Record, Samples
 from fusion.analysis.drift_model.search import Decision, Reason
 from fusion.analysis.effects.effect import Candidate
-from fusion.analysis.levels import RECORD_ENTRY_LEVEL
+from fusion.analysis.levels import ATTRIBUTION_LEVEL, RECORD_ENTRY_LEVEL
 from fusion.common import Array
 from fusion.results.parts import Quantity
 
@@ -40,6 +40,8 @@ _CENSORED_SHARE, _CENSORED = 0.1, 4
 #: A change belongs to a temperature or load that changes over the same window by so many robust standard deviations, and in no more than
 #: this share of all windows by as much.
 _UNUSUAL, _SELDOM = 4.0, 0.02
+#: Window in which a temperature turns as a load is switched, as a share of the record.
+_TURN_SHARE = 1.0 / 400.0
 #: Points of a closer look, and how long a change may take, as shares of it.
 _POINTS = 160
 _DURATIONS = (0.0, 0.02, 0.035, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45)
@@ -178,6 +180,8 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
             decisions.append(Decision("step_event", Reason.TOO_MANY_EVENTS, evidence))
             cells.leave_out(many)
             found = [replace(one, size=np.where(many, 0.0, one.size)) for one in found if one.size[~many].any()]
+    if len(found) > 1 and (behind := cells.load_behind(found)).evidence["p_value"] < ATTRIBUTION_LEVEL:
+        return [], [*decisions, behind]
     if not found:
         return [], decisions
     left = cells.response - cells.moved @ cells.slopes[cells.windows()[-1]]
@@ -317,6 +321,23 @@ class _Cells:
             if own > _UNUSUAL * scale and own > 0.0 and (all_of_it >= own).mean() < _SELDOM:
                 return name
         return ""
+
+    def load_behind(self, events: list[Event]) -> Decision:
+        """Whether some temperature turns at every event more than at most other times, as where a load is switched that nobody logged: the
+        ranks of its turns by Fisher's method (1932), over all temperatures.
+        """
+        mean = max(_SHORTEST, int(np.isfinite(self.seconds).sum() * _TURN_SHARE))
+        changes = _changes(self.moved[:, : len(self.names)], 0, mean)
+        turns = np.abs(changes[mean:] - changes[:-mean])
+        at = [int(np.nanargmin(np.abs(self.seconds - one.onset.value))) - 2 * mean for one in events]
+        here = turns[np.clip(at, 0, len(turns) - 1)]
+        # Where nothing is known, nothing turns.
+        rank = [np.where(np.isnan(one), 1.0, np.nanmean(turns >= one, axis=0)) for one in here]
+        p = stats.chi2.sf(-2.0 * np.log(rank).sum(axis=0), 2 * len(events)) * len(self.names)
+        evidence = {"p_value": float(p.min()), "name": self.names[int(p.argmin())], "events": len(events)}
+        return Decision(
+            "step_event", Reason.UNLOGGED_LOAD, {**evidence, "search_p": min(one.p_value for one in events)}
+        )
 
     def ignore(self, seen: _Seen, channels: slice | int) -> None:
         """Leave the window of a change out of every later look at its channel, or at all of them."""
