@@ -340,9 +340,10 @@ class _Cells:
         )
 
     def ignore(self, seen: _Seen, channels: slice | int) -> None:
-        """Leave the window of a change out of every later look at its channel, or at all of them."""
+        """Leave the window of a change out of later looks at its channel, or at all; after a slow one the channel out of slow looks."""
         if seen.run is not None:
-            seen.run.ignore(seen, channels)
+            seen.run.ignored.add(seen.channel)
+            seen.run.found.pop(seen.channel, None)
             return
         first, last = seen.at - seen.mean, seen.at + seen.gap + seen.mean
         for (gap, mean), scaled in self.excursions.items():
@@ -482,7 +483,8 @@ class _Run:
         self.moved = cells.moved[self.here].reshape(self.number, group, -1).mean(axis=1)
         centred = self.moved - self.moved.mean(axis=0)
         self.beside = np.column_stack([np.ones(self.number), centred @ _leading(centred, self.number)])
-        self.ignored: dict[int, list[tuple[float, float]]] = {}
+        # Channels whose slow change is none of an event: what else is slow in them is not told from that.
+        self.ignored = set[int]()
         self.found: dict[int, _Seen] = {}
         self.trials: dict[bytes, _Trial] = {}
 
@@ -502,16 +504,10 @@ class _Run:
         """The most likely slow change of every channel."""
         for channel, response in enumerate(self.response().T):
             rows = np.flatnonzero(np.isfinite(response))
-            if channel in self.found or rows.size < _SLOW_LEAST:
+            if channel in self.found or channel in self.ignored or rows.size < _SLOW_LEAST:
                 continue
             trial = self._trial(rows, self.beside)
-            begin, end = trial.times
-            tried = np.ones(begin.size, bool)
-            for first, last in self.ignored.get(channel, []):
-                tried &= (end <= first) | (begin >= last)
-            if not tried.any():
-                continue
-            found = _Likely(*(one[0] for one in trial.likely(response[rows, None], tried)))
+            found = _Likely(*(one[0] for one in trial.likely(response[rows, None])))
             course = trial.courses[found.course]
             log_p = float(np.log(trial.p_value(float(found.gain), int(found.without))))
             self.found[channel] = _Seen(log_p, 0, 0, 0, channel, course, self)
@@ -579,17 +575,6 @@ class _Run:
             if gain > _MORE * other and trial.p_value(float(gain), int(drift)) * len(names) < RECORD_ENTRY_LEVEL:
                 return name
         return ""
-
-    def ignore(self, seen: _Seen, channels: slice | int) -> None:
-        """Leave the time of a slow change out of every later look at its channel, or at all of them."""
-        assert seen.course is not None
-        for channel in (
-            np.arange(self.cells.response.shape[1])[channels].ravel() if isinstance(channels, slice) else [channels]
-        ):
-            self.ignored.setdefault(int(channel), []).append(
-                (seen.course.onset_s, seen.course.onset_s + seen.course.duration_s)
-            )
-            self.found.pop(int(channel), None)
 
     def forget(self, channels: NDArray[np.bool_]) -> None:
         """Look again at some channels, which have changed."""
@@ -707,8 +692,9 @@ class _Look:
         best = self.best(channels)
         size, u = self.sizes(best)
         onset, duration, u_course = self.intervals(best, channels)
-        # What began before the first onset that was tried has no onset here.
-        if onset.low <= self.courses[0].onset_s:
+        # What began before the first onset that was tried has no onset here, and what settles from the first readings on is a warm-up.
+        settled_s = best.duration_s / _TIME_CONSTANTS if best.settles else 0.0
+        if onset.low <= self.courses[0].onset_s or onset.value < self.instants[0, 0] + settled_s:
             return None
         return Event(
             columns=np.empty((0, 1)),
