@@ -696,6 +696,11 @@ class _Look:
         settled_s = best.duration_s / _TIME_CONSTANTS if best.settles else 0.0
         if onset.low <= self.courses[0].onset_s or onset.value < self.instants[0, 0] + settled_s:
             return None
+        # Courses that fit nearly as well may have sizes that are far apart.
+        u = np.hypot(u, u_course)
+        part &= np.abs(size) > 2.0 * u
+        if not part[seen.channel]:
+            return None
         return Event(
             columns=np.empty((0, 1)),
             parameters={"time_s": onset.value, "duration_min": duration.value / 60.0, "course": best.words},
@@ -705,7 +710,7 @@ class _Look:
             onset=onset,
             duration=duration,
             size=np.where(part, size, 0.0),
-            size_u=np.where(part, np.hypot(u, u_course), 0.0),
+            size_u=np.where(part, u, 0.0),
             p_value=min(1.0, float(np.exp(seen.log_p))),
             answer=self.answer(best, seen.channel),
         )
