@@ -180,8 +180,10 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
             decisions.append(Decision("step_event", Reason.TOO_MANY_EVENTS, evidence))
             cells.leave_out(many)
             found = [replace(one, size=np.where(many, 0.0, one.size)) for one in found if one.size[~many].any()]
-    if len(found) > 1 and (behind := cells.load_behind(found)).evidence["p_value"] < ATTRIBUTION_LEVEL:
-        return [], [*decisions, behind]
+    p, name = cells.load_behind(found) if len(found) > 1 else (1.0, "")
+    if p < ATTRIBUTION_LEVEL:
+        evidence = {"events": len(found), "name": name, "p_value": p, "search_p": min(one.p_value for one in found)}
+        return [], [*decisions, Decision("step_event", Reason.UNLOGGED_LOAD, evidence)]
     if not found:
         return [], decisions
     left = cells.response - cells.moved @ cells.slopes[cells.windows()[-1]]
@@ -322,9 +324,9 @@ class _Cells:
                 return name
         return ""
 
-    def load_behind(self, events: list[Event]) -> Decision:
-        """Whether some temperature turns at every event more than at most other times, as where a load is switched that nobody logged: the
-        ranks of its turns by Fisher's method (1932), over all temperatures.
+    def load_behind(self, events: list[Event]) -> tuple[float, str]:
+        """The temperature that turns most at every event, as where a load is switched that nobody logged, and the probability of that by
+        chance: ranks of its turns, by Fisher's method (1932) and over all temperatures.
         """
         mean = max(_SHORTEST, int(np.isfinite(self.seconds).sum() * _TURN_SHARE))
         changes = _changes(self.moved[:, : len(self.names)], 0, mean)
@@ -334,10 +336,7 @@ class _Cells:
         # Where nothing is known, nothing turns.
         rank = [np.where(np.isnan(one), 1.0, np.nanmean(turns >= one, axis=0)) for one in here]
         p = stats.chi2.sf(-2.0 * np.log(rank).sum(axis=0), 2 * len(events)) * len(self.names)
-        evidence = {"p_value": float(p.min()), "name": self.names[int(p.argmin())], "events": len(events)}
-        return Decision(
-            "step_event", Reason.UNLOGGED_LOAD, {**evidence, "search_p": min(one.p_value for one in events)}
-        )
+        return float(p.min()), self.names[int(p.argmin())]
 
     def ignore(self, seen: _Seen, channels: slice | int) -> None:
         """Leave the window of a change out of later looks at its channel, or at all; after a slow one the channel out of slow looks."""
@@ -352,8 +351,8 @@ class _Cells:
     def closer(self, seen: _Seen, digits: Array) -> Event | None:
         """Onset, duration and size of a change by the likelihood of the readings around it; None where these show none."""
         if seen.run is not None:
-            looked, shown = seen.run.look(seen)
-            return looked.event(seen, digits, shown)
+            whole, shown = seen.run.look(seen)
+            return whole.event(seen, digits, shown)
         left = self.response - self.moved @ self.slopes[seen.gap, seen.mean]
         half, longest = 3 * max(seen.gap, seen.mean, 2 * _SHORTEST), left.shape[0] // 8
         looks = list[tuple[_Look, Course, Array, Array]]()
