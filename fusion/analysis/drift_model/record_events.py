@@ -23,7 +23,7 @@ from fusion.analysis.drift_model.null_simulation import DRAWS, tail_probability
 from fusion.analysis.drift_model.record_data import Record, Samples
 from fusion.analysis.drift_model.search import Decision, Reason
 from fusion.analysis.effects.effect import Candidate
-from fusion.analysis.levels import ATTRIBUTION_LEVEL, RECORD_ENTRY_LEVEL
+from fusion.analysis.levels import RECORD_ENTRY_LEVEL
 from fusion.common import Array
 from fusion.results.parts import Quantity
 
@@ -54,8 +54,9 @@ _WALKS, _SMOOTH = (0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0), (0.0, 1e-5, 1e-3, 1e-2)
 _AROUND, _FACTORS, _ONSETS = 1.2, np.geomspace(0.4, 2.5, 13), 48
 #: A slow change belongs to a temperature or load that gains so many times as much by a change then as by any other.
 _MORE = 2.0
-#: Log-likelihood by which the best may beat what a 95 % interval still holds, and that a course of two parts must gain.
-_WITHIN, _SECOND_PART = 1.92, 3.0
+#: Log-likelihood by which the best may beat what a 95 % interval still holds, half of 7.35 as it has a corner at an instant (Hansen 2000,
+#: Econometrica 68, 575), and that a course of two parts must gain.
+_WITHIN, _SECOND_PART = 3.68, 3.0
 #: Standard uncertainties from which on a channel takes part in an event that another shows.
 _TAKES_PART = 4.0
 #: Standard uncertainties within which two looks give a change one size.
@@ -156,7 +157,7 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
     """
     samples, digits = record.readings, record.displacement_step
     inside, switched = (each[samples.block] for each in (used, record.switched()))
-    cells, found, decisions = _Cells.of(samples, inside), list[Event](), list[Decision]()
+    cells, found, decisions, times = _Cells.of(samples, inside), list[Event](), list[Decision](), list[float]()
     if cells is None:
         return [], []
     while (seen := cells.most_striking() or cells.most_likely()) is not None:
@@ -173,6 +174,7 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
             cells.ignore(seen, slice(None))
             continue
         found.append(event)
+        times.append(event.onset.value)
         cells.take_out(event)
         many = np.sum([one.size != 0.0 for one in found], axis=0) > MOST_OF_A_CHANNEL
         if many.any():
@@ -180,9 +182,9 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
             decisions.append(Decision("step_event", Reason.TOO_MANY_EVENTS, evidence))
             cells.leave_out(many)
             found = [replace(one, size=np.where(many, 0.0, one.size)) for one in found if one.size[~many].any()]
-    p, name = cells.load_behind(found) if len(found) > 1 else (1.0, "")
-    if p < ATTRIBUTION_LEVEL:
-        evidence = {"events": len(found), "name": name, "p_value": p, "search_p": min(one.p_value for one in found)}
+    p, name = cells.load_behind(times) if len(times) > 1 else (1.0, "")
+    if found and p < RECORD_ENTRY_LEVEL:
+        evidence = {"events": len(times), "name": name, "p_value": p, "search_p": min(one.p_value for one in found)}
         return [], [*decisions, Decision("step_event", Reason.UNLOGGED_LOAD, evidence)]
     if not found:
         return [], decisions
@@ -324,18 +326,18 @@ class _Cells:
                 return name
         return ""
 
-    def load_behind(self, events: list[Event]) -> tuple[float, str]:
-        """The temperature that turns most at every event, as where a load is switched that nobody logged, and the probability of that by
-        chance: ranks of its turns, by Fisher's method (1932) and over all temperatures.
+    def load_behind(self, times: list[float]) -> tuple[float, str]:
+        """The temperature that turns most at the times of all events, s, as where a load is switched that nobody logged, and the chance of
+        that: ranks of its turns, by Fisher's method (1932) and over all temperatures.
         """
         mean = max(_SHORTEST, int(np.isfinite(self.seconds).sum() * _TURN_SHARE))
         changes = _changes(self.moved[:, : len(self.names)], 0, mean)
         turns = np.abs(changes[mean:] - changes[:-mean])
-        at = [int(np.nanargmin(np.abs(self.seconds - one.onset.value))) - 2 * mean for one in events]
+        at = [int(np.nanargmin(np.abs(self.seconds - one))) - 2 * mean for one in times]
         here = turns[np.clip(at, 0, len(turns) - 1)]
         # Where nothing is known, nothing turns.
         rank = [np.where(np.isnan(one), 1.0, np.nanmean(turns >= one, axis=0)) for one in here]
-        p = stats.chi2.sf(-2.0 * np.log(rank).sum(axis=0), 2 * len(events)) * len(self.names)
+        p = stats.chi2.sf(-2.0 * np.log(rank).sum(axis=0), 2 * len(times)) * len(self.names)
         return float(p.min()), self.names[int(p.argmin())]
 
     def ignore(self, seen: _Seen, channels: slice | int) -> None:

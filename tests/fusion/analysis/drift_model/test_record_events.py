@@ -63,7 +63,7 @@ def test_changes_with_a_temperature_that_turns_are_responses_to_a_load_that_no_l
     load = (SECONDS // 20_000.0 % 2.0)[:, None] * [6.0, 0.0, -4.0]
     assert len(found(load)[0]) == 3
     warmed = respond(load[:, :1], SECONDS, time_constant_s=600.0)[:, 0]
-    events, reasons = found(load, warmed=0.2 * warmed)
+    events, reasons = found(load, warmed=0.4 * warmed)
     assert not events and Reason.UNLOGGED_LOAD in reasons
 
 
