@@ -68,6 +68,8 @@ _TAIL = 1.5
 #: Fewest readings, and fewest points and degrees of freedom that tell anything, and iterations of a robust regression.
 _LEAST_READINGS, _LEAST_POINTS, _LEAST_FREEDOM, _ITERATIONS = 40, 8, 3, 5
 _EVERY_OTHER = "in every other reading around it"
+#: Share of the square of an event that one which takes it back leaves at most.
+_TAKEN_BACK = 0.25
 #: More events than this in one channel are a switching that nobody logged.
 MOST_OF_A_CHANNEL = 3
 
@@ -157,7 +159,7 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
     """
     samples, digits = record.readings, record.displacement_step
     inside, switched = (each[samples.block] for each in (used, record.switched()))
-    cells, found, decisions, times = _Cells.of(samples, inside), list[Event](), list[Decision](), list[float]()
+    cells, found, decisions, every = _Cells.of(samples, inside), list[Event](), list[Decision](), list[Event]()
     if cells is None:
         return [], []
     while (seen := cells.most_striking() or cells.most_likely()) is not None:
@@ -174,7 +176,7 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
             cells.ignore(seen, slice(None))
             continue
         found.append(event)
-        times.append(event.onset.value)
+        every.append(event)
         cells.take_out(event)
         many = np.sum([one.size != 0.0 for one in found], axis=0) > MOST_OF_A_CHANNEL
         if many.any():
@@ -182,6 +184,7 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
             decisions.append(Decision("step_event", Reason.TOO_MANY_EVENTS, evidence))
             cells.leave_out(many)
             found = [replace(one, size=np.where(many, 0.0, one.size)) for one in found if one.size[~many].any()]
+    found, times = _lasting(found), [one.onset.value for one in _lasting(every)]
     p, name = cells.load_behind(times) if len(times) > 1 else (1.0, "")
     if found and p < RECORD_ENTRY_LEVEL:
         evidence = {"events": len(times), "name": name, "p_value": p, "search_p": min(one.p_value for one in found)}
@@ -511,7 +514,8 @@ class _Run:
             found = _Likely(*(one[0] for one in trial.likely(response[rows, None])))
             course = trial.courses[found.course]
             log_p = float(np.log(trial.p_value(float(found.gain), int(found.without))))
-            self.found[channel] = _Seen(log_p, 0, 0, 0, channel, course, self)
+            at = self.here.start + int((course.onset_s - self.instants[0, 0]) / self.cells.step_s)
+            self.found[channel] = _Seen(log_p, at, 0, 0, channel, course, self)
         return list(self.found.values())
 
     def _trial(self, rows: NDArray[np.intp], beside: Array) -> _Trial:
@@ -771,6 +775,19 @@ class _Look:
         return Answer(
             slope, float(np.hypot(other_u, slope * u)) / abs(size), self.seconds.size // 2, where=_EVERY_OTHER
         )
+
+
+def _lasting(events: list[Event]) -> list[Event]:
+    """The events that no other takes back: what returns is no lasting change, and a wrong one is made good by the next look."""
+
+    def is_taken_back(one: Event) -> bool:
+        return any(
+            abs(other.onset.value - one.onset.value) <= max(one.duration.value, other.duration.value)
+            and np.sum((other.size + one.size) ** 2) < _TAKEN_BACK * np.sum(one.size**2)
+            for other in events
+        )
+
+    return [one for one in events if not is_taken_back(one)]
 
 
 def _is_settled(
