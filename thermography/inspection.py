@@ -44,16 +44,9 @@ class FileWarning:
 
 @dataclass(frozen=True)
 class FlirInspection:
-    """Content of one FLIR file.
-
-    Attributes
-    ----------
-    frames : usable frames in order of time
-    rejected : frames that cannot be used, and why
-    evaluation
-        Maximum, minimum and mean of every frame and of the regions that it stores, see `thermography.evaluation.evaluate_regions`;
-        None where the parameters give no temperature
-    warnings : everything that is implausible or damaged
+    """Content of one FLIR file: usable frames in order of time, rejected ones, maximum, minimum and mean of every frame and of the regions
+    that it stores (see `thermography.evaluation.evaluate_regions`; None where the parameters give no temperature), and everything that is
+    implausible or damaged.
     """
 
     path: Path

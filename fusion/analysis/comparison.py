@@ -221,13 +221,8 @@ _SHIFTS = np.linspace(-0.5, 0.5, 101)
 
 @dataclass(frozen=True)
 class TableFault:
-    """How a table acted by the profiles of two tests.
-
-    Attributes
-    ----------
-    names : faults under which the difference is most probable, the most probable first; empty where none is shown
-    gain, gain_u : with which the table acted; 1 where all is well
-    told : whether the tests tell that from a table that is not active
+    """How a table acted by the profiles of two tests: faults under which the difference is most probable, the likeliest first, none where
+    none is shown; the gain with which it acted, 1 where all is well; `told` where the tests tell that from a table that is not active.
     """
 
     names: tuple[str, ...]

@@ -150,14 +150,8 @@ def _source(text: str) -> tuple[str, float]:
 
 @dataclass(frozen=True)
 class Verification:
-    """As found and as left.
-
-    Attributes
-    ----------
-    before, after : titles of the campaigns
-    channels : one verdict per displacement that is corrected
-    remarks : what to know, one sentence each
-    test : what the sheet says of the test after
+    """As found and as left: titles of both campaigns, a verdict per displacement that is corrected, what to know, and what the sheet says
+    of the test after.
     """
 
     before: str

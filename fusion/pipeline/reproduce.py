@@ -26,13 +26,7 @@ _LONGEST = 60
 
 @dataclass(frozen=True)
 class Reproduction:
-    """What a second run of the same campaign gave.
-
-    Attributes
-    ----------
-    equal : whether ``results.json`` is the same, byte for byte
-    lines : what was compared, or what differs
-    """
+    """Whether a second run of the same campaign gave the same ``results.json``, byte for byte, and what was compared or differs."""
 
     equal: bool
     lines: tuple[str, ...]

@@ -234,14 +234,8 @@ _ANEW = "its first cycle has changed, so the file was restarted; restart the wat
 
 @dataclass(frozen=True, eq=False)
 class Arrived:
-    """What has come since the last look.
-
-    Attributes
-    ----------
-    readings : number of new readings, in finished and unfinished cycles
-    cycles : Dataset or None
-        Finished cycles that were not given before, and the one that is still being measured last; None where none has been finished.
-    faults : lines that cannot be used, or why the file cannot be read
+    """What has come since the last look: number of new readings; the finished cycles that were not given before with the one being measured
+    last, None where none has been finished; lines that cannot be used, or why the file cannot be read.
     """
 
     readings: int = 0
@@ -476,13 +470,8 @@ class FinishedCycle:
 
 @dataclass(frozen=True)
 class Enough:
-    """Whether the cycles so far are enough.
-
-    Attributes
-    ----------
-    u_um : standard uncertainty of a position against the first one that all cycles so far reach, um; the largest of the targets
-    cycles_for_wanted : number of cycles that reaches the wanted uncertainty
-    lacks : what an analysis still lacks, in words; empty where nothing is lacking
+    """Whether the cycles so far are enough: the largest standard uncertainty of a position against the first one that they reach, um, how
+    many reach the wanted one, and what an analysis still lacks, in words.
     """
 
     cycles: int

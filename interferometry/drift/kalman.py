@@ -504,12 +504,8 @@ class Smoothed(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Noise that neighbouring readings share, with a correlation that falls exponentially in time.
-
-    Attributes
-    ----------
-    share : of the variance of an ordinary reading, 0 to 1
-    time_s : correlation time, s
+    """Noise that neighbouring readings share: its part of the variance of an ordinary reading, and the time in which its correlation falls
+    to 1/e, s.
     """
 
     share: float

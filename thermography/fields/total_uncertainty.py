@@ -56,14 +56,7 @@ class EmissivityRegion:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Cells of the plan that share an emissivity.
-
-    Attributes
-    ----------
-    name : name of the region; empty for the rest of the table
-    emissivity, emissivity_u : emissivity and its standard uncertainty
-    cells : (y, x), its cells
-    """
+    """Cells (y, x) of the plan that share an emissivity, with its standard uncertainty; the rest of the table has no name."""
 
     name: str
     emissivity: float
@@ -176,12 +169,8 @@ _COMPARED = 3
 
 @dataclass(frozen=True, eq=False)
 class Nonlinearity:
-    """Common uncertainty by propagation of distributions over that of first order, for one surface.
-
-    Attributes
-    ----------
-    temperature_degC, ratio : (n,), of temperatures, increasing
-    rise_ratio : of the largest rise
+    """Common uncertainty by propagation of distributions over that of first order, for one surface: of temperatures (n,), increasing, and
+    of the largest rise.
     """
 
     temperature_degC: Array

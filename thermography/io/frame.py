@@ -87,13 +87,8 @@ class CameraParameters:
 
 @dataclass(frozen=True)
 class CameraIdentity:
-    """Camera and lens that recorded a frame; empty where the file does not name them.
-
-    Attributes
-    ----------
-    model, part, serial, software : model name, part number, serial number and firmware version of the camera
-    lens_model, lens_part, lens_serial : name, part number and serial number of the lens
-    field_of_view_deg : horizontal field of view of the lens, degrees; 0 where it is not stored
+    """Camera and lens that recorded a frame, each with name, part and serial number, firmware version and horizontal field of view
+    (degrees); empty or 0 where the file does not name them.
     """
 
     model: str = ""
@@ -108,13 +103,7 @@ class CameraIdentity:
 
 @dataclass(frozen=True)
 class CalibratedRange:
-    """Range in which the camera is calibrated.
-
-    Attributes
-    ----------
-    minimum_K, maximum_K : limits in temperature, K; both 0 where the file does not store them
-    raw_minimum, raw_maximum : limits in counts; 0 and 65535 where the file does not store them
-    """
+    """Range in which the camera is calibrated, K (both 0 where the file does not store it) and counts."""
 
     minimum_K: float = 0.0
     maximum_K: float = 0.0
@@ -223,13 +212,8 @@ class PlainSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameReference(FrameHeader, ABC):
-    """A frame in a file: its header, and how its pixels are read; further attributes are those of `FrameHeader`.
-
-    Attributes
-    ----------
-    path : path of the file
-    index : index of the frame in the file, from 0
-    altered : whether the header differs from the checksum that the file holds of it
+    """A frame in a file: its header, and how its pixels are read; `altered` where the header differs from the checksum that the file holds
+    of it; further attributes are those of `FrameHeader`.
     """
 
     path: Path
@@ -258,14 +242,7 @@ class FrameReference(FrameHeader, ABC):
 
 @dataclass(frozen=True)
 class RejectedFrame:
-    """A frame or a file that was not used.
-
-    Attributes
-    ----------
-    path : path of the file
-    index : index of the frame in its file, from 0; 0 where the whole file is rejected
-    reason : why it was rejected, with file and offset
-    """
+    """A frame, by its index, or with 0 a whole file that was not used, and why, with file and offset."""
 
     path: Path
     index: int

@@ -107,12 +107,8 @@ class InputUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class TemperatureBudget:
-    """Uncertainty budget of temperatures or temperature rises; all arrays have their shape.
-
-    Attributes
-    ----------
-    common : contribution of each input that all frames share, K: sensitivity coefficient, with its sign, times standard uncertainty
-    per_frame : contributions of noise and quantisation, K
+    """Uncertainty budget of temperatures or temperature rises, in arrays of their shape, K: of each input that all frames share its
+    sensitivity coefficient, with its sign, times standard uncertainty; and noise and quantisation.
     """
 
     common: dict[str, Array]

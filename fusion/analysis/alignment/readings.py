@@ -42,14 +42,8 @@ def check_readings(dataset: xr.Dataset, name: str, source: str, error: type[Fusi
 
 @dataclass(frozen=True)
 class Series:
-    """A logged quantity on its own times.
-
-    Attributes
-    ----------
-    seconds : (m,), s, time since the first reading, increasing
-    values : (m,) or (m, targets), one value for all sites, or one per target position
-    units : unit of the values
-    first : number of the sample with which every run begins; runs have nothing to do with each other
+    """A logged quantity on its own times: `seconds` (m,) since the first reading, increasing, s; `values` (m,), or (m, targets) with one
+    per target position, in `units`; `first` the numbers of the samples with which runs begin, which have nothing to do with each other.
     """
 
     seconds: Array
@@ -83,13 +77,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Gap:
-    """A time in which a series has no sample and is interpolated linearly.
-
-    Attributes
-    ----------
-    series : its name
-    start_s, end_s : times of the samples on either side, since the first reading, s
-    """
+    """A time in which a series has no sample and is interpolated linearly: from one sample to the next, s since the first reading."""
 
     series: str
     start_s: float

@@ -34,12 +34,8 @@ _MOST_CHANGES = 1000
 
 @dataclass(frozen=True)
 class SwitchingPatch:
-    """A patch of the plan whose apparent temperature switches.
-
-    Attributes
-    ----------
-    pattern : (y, x) relative size of the jump, about 1 on the patch, 0 where the plan is not seen
-    course : (time,) how much warmer than at first each frame shows the patch by its jumps, K
+    """A patch of the plan whose apparent temperature switches: `pattern` (y, x) of the jump, about 1 on the patch, 0 where the plan is not
+    seen; `course` (time,), how much warmer than at first each frame shows it by its jumps, K.
     """
 
     pattern: Array

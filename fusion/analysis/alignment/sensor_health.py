@@ -45,16 +45,8 @@ _SWITCHED = 0.05
 
 @dataclass(frozen=True)
 class Grid:
-    """Medians of the samples in equal steps of time.
-
-    Attributes
-    ----------
-    seconds : (n,) middle of each step, s
-    step_s : length of a step, s
-    temperature : (n, sensors) interpolated where nothing was read, degC
-    known : (n, sensors) True where something was read
-    drivers : (n, k) loads as shares of their range, and their squares
-    is_fine : whether it is the fine grid
+    """Medians of the samples in equal steps of time, s at their middle: temperatures (n, sensors), interpolated where nothing was read,
+    degC; `known` where something was; loads (n, k) as shares of their range, and their squares.
     """
 
     seconds: Array
@@ -132,14 +124,8 @@ def _best_ramp(place: Array, values: Array, begins: NDArray[np.intp], ends: NDAr
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes of one sensor over one duration.
-
-    Attributes
-    ----------
-    before, after : (m,) last step before and first step after each change
-    residual : (m,) what is left of the change by the prediction, K
-    reach : steps within which two changes share samples
-    least_K : resolution of the sensor
+    """Changes of one sensor over one duration: last step before and first step after each, what its prediction leaves of it, K, steps
+    within which two share samples, and the resolution of the sensor.
     """
 
     before: NDArray[np.intp]

@@ -301,14 +301,8 @@ def _load_left(rate: _Rate, at: Array, *loads: Array) -> float:
 
 @dataclass(frozen=True)
 class _Rate:
-    """Increments of the field's leading modes from frame to frame, whitened as a random walk, without a slow trend.
-
-    Attributes
-    ----------
-    seconds : (n + 1,) times of the frames, s
-    weight : (n,) one over the square root of each step
-    trend : (n, 3) orthonormal columns of a steady rate and of a warm-up before the log
-    modes : (n, 2) the increments
+    """Increments (n, 2) of the field's leading modes from frame to frame (n + 1 times, s), whitened as a random walk by `weight` (n,), one
+    over the square root of each step; `trend` (n, 3) holds orthonormal columns of a steady rate and of a warm-up before the log.
     """
 
     seconds: Array

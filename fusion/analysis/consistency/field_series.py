@@ -24,14 +24,8 @@ LEAST_CHANGE_K = 1.0
 
 @dataclass(frozen=True)
 class FieldSeries:
-    """Temperature of cells over time.
-
-    Attributes
-    ----------
-    start : time of the first frame
-    seconds : (n,) times since `start`, at least a minute apart, s
-    temperature : (n, cells) of cells that every one of these frames shows whole, degC
-    x_mm, y_mm : (cells,) centres of the cells, mm
+    """Temperature (n, cells) of the cells that every frame shows whole, degC, with their centres, mm, at times at least a minute apart, s
+    since `start`.
     """
 
     start: np.datetime64
@@ -113,14 +107,8 @@ def _clock(frames: xr.DataArray) -> tuple[np.datetime64, Array]:
 
 @dataclass(frozen=True)
 class Logged:
-    """What the environment log holds of the table, with what the camera shows near its material sensor.
-
-    Attributes
-    ----------
-    near : the camera at the sensor's place, or everywhere where that is not known
-    inside : (n,) whether the log covers each frame
-    material : (m,) logged temperature at those that it covers, degC
-    air : (m,) that of the air, None where it is not logged
+    """What the environment log holds of the table where it covers a frame (`inside` of them), material and air in degC, with what the
+    camera shows near its material sensor, or everywhere where its place is not known.
     """
 
     near: FieldSeries

@@ -23,12 +23,8 @@ _LARGEST_STEP = 0.2
 
 @dataclass(frozen=True)
 class Motion:
-    """Stamps of the frames of a still table, and the motion of the axis.
-
-    Attributes
-    ----------
-    seconds, cycle_end, reading_s : times of frames, ends of cycles and readings since the first frame, s
-    position_mm : of the readings
+    """Stamps of the frames of a still table, ends of cycles and readings, s since the first frame, and the position of the axis at the
+    readings.
     """
 
     seconds: Array

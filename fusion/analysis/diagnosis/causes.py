@@ -10,13 +10,7 @@ from thermofuse.resources import sentence, vocabulary
 
 @dataclass(frozen=True)
 class CauseRecord:
-    """A cause as a reader meets it.
-
-    Attributes
-    ----------
-    words : name in words
-    check : what to inspect on the machine, or how to repeat the test; one sentence
-    """
+    """A cause as a reader meets it: its name in words, and in one sentence what to inspect on the machine, or how to repeat the test."""
 
     words: str
     check: str

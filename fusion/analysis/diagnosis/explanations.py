@@ -71,16 +71,9 @@ class DirectionParts:
 
 @dataclass(frozen=True)
 class Residual:
-    """What one target shows beyond its mean and the drift of all targets.
-
-    Attributes
-    ----------
-    target : target number, from 1
-    seconds : (cycles,) mean time of the target's readings in each cycle since the first reading, s
-    values : (2, cycles) residual in the positive and in the negative direction, NaN where missing, um
-    cycle : (cycles,) cycle numbers
-    typical_um : robust standard deviation that this target would have if it scattered like the others, at least that of their rounding, um
-    temperature : (frames,) each, times, s, and local temperature rise, K; None where the camera does not see the target
+    """What a target shows beyond its mean and the drift of all, (2, cycles) um by positive and negative direction, NaN where missing, at
+    the mean time of its readings, s; the robust standard deviation that it would have if it scattered like the others, rounding included;
+    and times (s) and local rise (K) at the frames, None where the camera does not see it.
     """
 
     target: int
@@ -144,13 +137,8 @@ class ProfileFit:
 
 @dataclass(frozen=True)
 class RandomWalkFit:
-    """Log-likelihoods (nats) of white noise with and without a random walk.
-
-    Attributes
-    ----------
-    white : white noise alone
-    shared : a random walk that both directions share
-    one_direction : a random walk in one direction only; minus infinity where one was not read
+    """Log-likelihoods (nats) of white noise alone, with a random walk that both directions share, and with one in one direction only; minus
+    infinity where one was not read.
     """
 
     white: float
@@ -348,14 +336,9 @@ _RARE_SHARE = 0.2
 
 @dataclass(frozen=True)
 class ScatterFit:
-    """Maximum log-likelihoods (nats) of three kinds of excess scatter, given the typical scatter of the other targets.
-
-    Attributes
-    ----------
-    both : excess scatter equal in both directions, Gaussian or with rare large values
-    one_direction : excess scatter in one direction only
-    along_approach : one-sided, exponentially distributed amounts along the direction of motion, short of the target (as of a carriage
-        that sticks) or beyond it
+    """Maximum log-likelihoods (nats) of three kinds of excess scatter, given the typical scatter of the other targets: equal in both
+    directions, Gaussian or with rare large values; in one direction only; one-sided along the direction of motion, short of the target (as
+    of a carriage that sticks) or beyond it.
     """
 
     both: float

@@ -36,13 +36,8 @@ say = partial(sentence, "diagnosis", "remainder")
 
 @dataclass(frozen=True)
 class PermutationTest:
-    """Several statistics of a residual against their permutation distribution.
-
-    Attributes
-    ----------
-    p_value : family-wise, over all statistics
-    p_values : of each statistic alone
-    strongest : name of the most unusual statistic
+    """Several statistics of a residual against their permutation distribution: family-wise p-value, that of each alone, and the most
+    unusual one.
     """
 
     p_value: float

@@ -239,13 +239,8 @@ _ONE_PATTERN = 0.9
 
 @dataclass(frozen=True)
 class Contribution:
-    """What a term of the final model contributes, about the mean of every site or channel.
-
-    Attributes
-    ----------
-    rms_um : its root mean square, um
-    pattern : its leading pattern over the sites or channels, of unit length
-    loss : log-likelihood that all readings together lose without it
+    """What a term of the final model contributes, about the mean of every site or channel: rms, um; its leading pattern over these, of unit
+    length; and the log-likelihood that all readings together lose without it.
     """
 
     rms_um: float
@@ -261,14 +256,9 @@ def leading_pattern(series: Array) -> Array:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What stands beside the added effects of the final model.
-
-    Attributes
-    ----------
-    drift_um : root mean square of the random drift beside everything that the model names, um
-    is_smooth : whether that drift is an integrated random walk
-    total_um : root mean square of the readings about the mean of their site or channel, um
-    of_own_law : effects of which another load makes another size, because how their heat grows with the load is not known
+    """What stands beside the added effects of the final model: rms of the random drift that the model does not name, and whether that is
+    smooth; of the readings about the mean of their site or channel, um; and the effects of which another load makes another size, as how
+    their heat grows with it is not known.
     """
 
     drift_um: float

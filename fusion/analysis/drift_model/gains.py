@@ -33,14 +33,8 @@ _DEPENDENT = 1e-13
 
 @dataclass(frozen=True)
 class Group:
-    """Candidates with as many columns.
-
-    Attributes
-    ----------
-    places : (size,) their places among all candidates
-    width, beside : number of columns of each, and of those that are no evidence for it
-    candidates : those at the places
-    readings : (n,) places of the readings of the fit among all readings
+    """Candidates with as many columns, by their places among all; `beside` of these columns are no evidence; `readings` (n,) of the fit
+    among all readings.
     """
 
     places: NDArray[np.int64]
@@ -322,13 +316,8 @@ def _orthonormal(normal: Array) -> Array:
 
 @dataclass(frozen=True)
 class Orthogonalised:
-    """Products beside the design, which may be known beforehand.
-
-    Attributes
-    ----------
-    squares : (r,) of every response, freed of the design
-    with_responses : (r, columns) of the candidates' columns with these responses
-    along_design : (k, columns) of the candidates' columns with an orthonormal basis of the design
+    """Products beside the design, which may be known beforehand: the squares (r,) of every response freed of it, those of the candidates'
+    columns with these (r, columns), and with an orthonormal basis of the design (k, columns).
     """
 
     squares: Array

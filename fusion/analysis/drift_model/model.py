@@ -433,13 +433,8 @@ def solve(normal: Array, moment: Array) -> Array:
 
 @dataclass(frozen=True)
 class PriorRows:
-    """Priors of a model's coefficients as further whitened readings, one each, without drift.
-
-    Attributes
-    ----------
-    design : (k, p) rows of the design
-    response : (k,) prior means in units of the noise
-    draws : (k, draws) the same for simulated responses
+    """Priors of a model's coefficients as further whitened readings without drift: rows of the design (k, p), prior means (k,) in units of
+    the noise, and the same for simulated responses (k, draws).
     """
 
     design: Array

@@ -126,14 +126,8 @@ _LATER = 0.5
 
 @dataclass(frozen=True)
 class Prediction:
-    """A prediction of all blocks of a record from some of them.
-
-    Attributes
-    ----------
-    predicted : (blocks, channels) um
-    coefficients : (p, channels) of the columns, um per unit of each
-    penalty : the shrinkage that forward chaining chose
-    chained_rmse : error of the forward-chained training blocks under it, mean over channels, um; NaN where there is none
+    """A prediction of all blocks of a record from some of them, (blocks, channels) um, with the coefficients (p, channels) of the columns,
+    the shrinkage that forward chaining chose, and the error under it, um, NaN where there is none.
     """
 
     predicted: Array

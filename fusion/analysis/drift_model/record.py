@@ -172,14 +172,8 @@ _PER_COLUMN = 8
 
 @dataclass(frozen=True)
 class RecordFit:
-    """A model fitted to a part of a record.
-
-    Attributes
-    ----------
-    record, used : the record, and the blocks (blocks,) that the fit was made from
-    terms : the effects, declared ones first; each with columns for all blocks, shared by the channels
-    channels : without the events, the generalised least-squares fit of every channel under its own drift
-    rows : the blocks of each channel's fit, as indices
+    """A model fitted to the `used` blocks of a record: its effects, declared ones first, with columns for all blocks, and for every
+    channel, without the events, the fit under its own drift, of its own blocks (`rows`).
     """
 
     record: Record

@@ -60,15 +60,7 @@ class RecordError(FusionError):
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """One run of a record.
-
-    Attributes
-    ----------
-    name : of its table
-    start : time of its first sample, UTC
-    first_s : that time on the record's own axis, s
-    held_out : whether it is held out
-    """
+    """One run of a record, named as its table: its first sample in UTC and on the record's own axis, s, and whether it is held out."""
 
     name: str
     start: np.datetime64
@@ -78,15 +70,8 @@ class RecordedRun:
 
 @dataclass(frozen=True)
 class Samples:
-    """Raw samples of a record, on its axis of time.
-
-    Attributes
-    ----------
-    seconds : (samples,) s
-    block, run : (samples,) number of the block and of the run that holds each
-    displacement : (samples, channels) um; NaN where there is none
-    moved : (samples, sensors and drivers) degC and share of the driver's largest size
-    names : of sensors and drivers
+    """Raw samples of a record on its axis of time, s: displacements, um, NaN where there is none; sensors and drivers by their names, degC
+    and share of the driver's largest size; and the block and the run that holds each.
     """
 
     seconds: Array

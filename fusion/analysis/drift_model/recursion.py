@@ -71,14 +71,8 @@ _TURNS, _SETTLED = 60, 1e-3
 
 @dataclass(frozen=True)
 class Signal:
-    """What one column follows.
-
-    Attributes
-    ----------
-    input : name of a sensor or driver
-    exponent : power of a driver; 1 for a sensor
-    time_constant_s : of the first-order state
-    starts_cold : whether the state is zero at the start, as that of a load that rests; else it is that of the first reading
+    """What one column follows: a sensor, or a power of a driver, through a first-order state that starts at zero, as that of a load that
+    rests, or at the first reading.
     """
 
     input: str
@@ -148,13 +142,8 @@ def evaluate_columns(record: Record, columns: Iterable[Signal]) -> Array:
 
 @dataclass(frozen=True)
 class Marginal:
-    """A course of which what nobody asks for is swept out: under noise and wandering, beside constants.
-
-    Attributes
-    ----------
-    square, moment, gram : of the whitened course, its products with the columns (p,), and those of the columns (p, p)
-    constant : part of minus twice the log-likelihood that depends on the wandering alone
-    free : number of readings less that of the constants
+    """A whitened course with what nobody asks for swept out: its square, its products with columns (p,), theirs (p, p), the part of minus
+    twice the log-likelihood that depends on the wandering alone, and the readings less the constants.
     """
 
     square: float
@@ -271,14 +260,9 @@ _Ahead = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class Following:
-    """How one displacement follows columns from its last value on.
-
-    Attributes
-    ----------
-    kept : (p,) the columns that it may follow
-    penalty : shrinkage of standardised coefficients; infinite where no reading predicts better than that it stays
-    coefficients : (p,) um per unit of each column
-    missed_um : root mean square that it missed of the later parts, infinite where there are none; of several runs what is expected
+    """How one displacement follows the `kept` (p,) columns from its last value on: the shrinkage of standardised coefficients, infinite
+    where no reading predicts better than that it stays; um per unit of each; and the rms that it missed of later parts, infinite where
+    there are none.
     """
 
     kept: NDArray[np.bool_]

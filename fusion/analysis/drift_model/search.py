@@ -84,14 +84,7 @@ say = partial(sentence, "decisions")
 
 @dataclass(frozen=True)
 class Decision:
-    """What was decided about one effect.
-
-    Attributes
-    ----------
-    effect : name of the effect
-    reason : why
-    evidence : the numbers and names behind it, by the fields of the reason's sentence
-    """
+    """What was decided about one effect and why, with the numbers and names behind it, by the fields of the reason's sentence."""
 
     effect: str
     reason: Reason
@@ -468,13 +461,7 @@ def no_progress(done: int, total: int, what: str) -> None:
 
 
 class Problem(ABC, Generic[M]):
-    """The data, as the procedure sees them.
-
-    Attributes
-    ----------
-    effects : the library by name
-    entry_level : family-wise p-value up to which an effect may enter
-    """
+    """The data, as the procedure sees them, with the library by name and the family-wise p-value up to which an effect may enter."""
 
     effects: Mapping[str, Effect]
     entry_level: float

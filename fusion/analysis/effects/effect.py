@@ -31,13 +31,8 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Wave:
-    """A harmonic course in time, computed at the readings that are asked for: hundreds of them at all readings fill the memory.
-
-    Attributes
-    ----------
-    shape : ``numpy.cos`` or ``numpy.sin``
-    seconds : (n,) time of each reading, s
-    period_s : its period, s
+    """A harmonic course (`numpy.cos` or `numpy.sin` of a period, s) in time, computed at the readings that are asked for: hundreds of them
+    at all readings fill the memory.
     """
 
     shape: Callable[[Array], Array]

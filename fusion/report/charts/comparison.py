@@ -151,13 +151,8 @@ def control_limits(values: np.ndarray) -> Limits | None:
 
 @dataclass(frozen=True)
 class Trend:
-    """A quantity over the dates of tests, in their order.
-
-    Attributes
-    ----------
-    when, value, half : (n,) days, values, and half the length of their error bars
-    limits : control limits that the tests before the last give; None of fewer than eight tests
-    tolerance : upper limit that the last test states; None without one
+    """A quantity over the dates of tests, in their order, with half the length of its error bars; control limits that the tests before the
+    last give, None of fewer than eight, and the upper limit that the last test states.
     """
 
     name: str

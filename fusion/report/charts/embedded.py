@@ -14,14 +14,8 @@ from markupsafe import Markup
 
 @dataclass(frozen=True)
 class EmbeddedChart:
-    """A chart as the macro ``draw`` of ``templates/charts.html.j2`` reads it.
-
-    Attributes
-    ----------
-    name : unique in its page; a word of letters, digits and underscores
-    seen : text alternative
-    height : CSS px that are kept free until it is drawn
-    item : Bokeh's document as JSON that may stand in a ``<script>``
+    """A chart as the macro ``draw`` of ``templates/charts.html.j2`` reads it: name, unique in its page; text alternative; CSS px that are
+    kept free until it is drawn; Bokeh's document as JSON that may stand in a ``<script>``.
     """
 
     name: str
@@ -31,14 +25,7 @@ class EmbeddedChart:
 
 
 class MapControls(NamedTuple):
-    """What the reader can choose of the map, and what the page says of it.
-
-    Attributes
-    ----------
-    quantities : entries of the menu
-    cycles : cycles that the slider goes through
-    note : what was thinned or averaged; empty where nothing was
-    """
+    """What the reader can choose of the map, a quantity and a cycle, and what the page says was thinned or averaged."""
 
     quantities: list[str]
     cycles: list[int]
@@ -46,13 +33,7 @@ class MapControls(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Charts as a page takes them in.
-
-    Attributes
-    ----------
-    charts : by name
-    thermal_map : what the reader can choose of the thermal map; None where it is not among the charts
-    """
+    """Charts by name as a page takes them in, and what the reader can choose of the thermal map where it is among them."""
 
     charts: dict[str, EmbeddedChart]
     thermal_map: MapControls | None = None

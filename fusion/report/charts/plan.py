@@ -357,14 +357,8 @@ _MISSING = -32768
 
 
 class Layer(NamedTuple):
-    """A quantity of the map.
-
-    Attributes
-    ----------
-    variable : its name in fields.nc
-    words, unit : as they are shown; "1" for a number without unit
-    decimals : that are shown
-    colours : name of its scale
+    """A quantity of the map: its variable in fields.nc, words, unit ("1" for none) and decimals as they are shown, and the name of its
+    scale.
     """
 
     variable: str

@@ -67,13 +67,8 @@ Tips: TypeAlias = Sequence[tuple[str, str]]
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart as a page shows it.
-
-    Attributes
-    ----------
-    figure : Bokeh figure, or a layout of several
-    seen : one sentence that says what is seen, for readers who do not see it: extent, extremes, direction of change
-    columns : what the reader can download: heading with unit, values; all of one length
+    """A chart as a page shows it: a Bokeh figure or layout; one sentence that says what is seen, for readers who do not see it; columns of
+    one length that the reader can download, by heading with unit.
     """
 
     figure: LayoutDOM

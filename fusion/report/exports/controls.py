@@ -49,13 +49,8 @@ _SPACING_TOLERANCE_MM = 1e-3
 
 @dataclass(frozen=True)
 class Profile:
-    """Positioning deviations without drift at the targets, in the order of the positions.
-
-    Attributes
-    ----------
-    position_mm : (n,), targets, increasing
-    deviation_um : (2, n), approach in positive and in negative direction
-    covariance_um2 : (2, n, 2, n), of the deviations
+    """Positioning deviations (2, n) without drift at the targets in the order of the positions, mm, by positive and negative approach, um,
+    with their covariance (2, n, 2, n).
     """
 
     position_mm: Array
@@ -65,13 +60,8 @@ class Profile:
 
 @dataclass(frozen=True)
 class ActiveTable:
-    """The table that was active during a test.
-
-    Attributes
-    ----------
-    name : name of its file
-    position_mm : (m,), its points, increasing
-    deviation_um : (2, m), what it takes for the deviation by the approach in positive and in negative direction
+    """The table that was active during a test: name of its file, its points (m,), increasing, and what it takes for the deviation (2, m) by
+    positive and negative approach.
     """
 
     name: str

@@ -124,13 +124,7 @@ Writer = Callable[[Path], object]
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export wrote.
-
-    Attributes
-    ----------
-    files : the files that were written
-    remarks : what to know of them, one sentence each
-    """
+    """The files that an export wrote, and what to know of them, one sentence each."""
 
     files: tuple[Path, ...]
     remarks: tuple[str, ...] = ()
