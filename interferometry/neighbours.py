@@ -35,7 +35,7 @@ def evaluate_conventional(deviations: xr.Dataset) -> xr.Dataset:
     """Evaluate each position on its own, equations (2), (3) and (5)."""
     x = deviations["deviation"]
     count = x.count("cycle")
-    spread = _standard_deviation(x, "cycle")
+    spread = _standard_deviation(x)
     k = xr.apply_ufunc(coverage_factor, count)
     mean = x.mean("cycle")
     return xr.Dataset(
@@ -98,7 +98,7 @@ def evaluate_neighbours(deviations: xr.Dataset) -> xr.Dataset:
     far = x.isel(target=slice(1, None)).rename(target="link")
     difference = near - far
     count = difference.count("cycle")
-    spread = _standard_deviation(difference, "cycle")
+    spread = _standard_deviation(difference)
     return xr.Dataset(
         {
             "mean_difference": difference.mean("cycle").assign_attrs(units="um"),
@@ -201,10 +201,10 @@ def _along_axis(deviations: xr.Dataset) -> xr.DataArray:
     return deviations["deviation"].isel(target=np.argsort(deviations["position"].values, kind="stable"))
 
 
-def _standard_deviation(x: xr.DataArray, dim: str) -> xr.DataArray:
-    """Return the sample standard deviation; NaN, without a warning, where there are fewer than two values."""
-    count = x.count(dim)
-    squares = ((x - x.mean(dim)) ** 2).sum(dim)
+def _standard_deviation(x: xr.DataArray) -> xr.DataArray:
+    """Return the sample standard deviation over the cycles; NaN, without a warning, where there are fewer than two values."""
+    count = x.count("cycle")
+    squares = ((x - x.mean("cycle")) ** 2).sum("cycle")
     return (squares / (count - 1).where(count > 1)) ** 0.5
 
 

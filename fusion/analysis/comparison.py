@@ -32,6 +32,7 @@ from fusion.results.loop import AxisLoop, Coefficient
 from fusion.results.parts import Quantity, TablePrediction
 from fusion.results.results import Results
 from interferometry.drift.estimate import COMPONENTS
+from interferometry.iso230.budget import LENGTHS
 from thermography.common import scatter_by_median
 
 # What changed in the profile of an axis between two tests, whatever thermal state each of them was in.
@@ -456,8 +457,6 @@ def compare_scatters(
     ]  # fmt: skip
 
 
-#: Inputs of the budget whose error is one and the same in all readings of a test.
-_OF_INSTRUMENTS = ("device", "alignment", "material_temperature", "expansion_coefficient")
 #: Expanded uncertainty of one of four values beyond which it is not as predicted, over the standard uncertainty: Bonferroni.
 _JUDGED_K = float(special.ndtri(1.0 - CHANGE_LEVEL / 8.0))
 #: A table whose reversal error differs less along the axis is one table and a backlash, um.
@@ -644,7 +643,7 @@ def hold_against(pair: PairComparison, prediction: TablePrediction) -> tuple[Ach
         first, second = (getattr(part, f"{symbol}_um") for part in (one, other))
         if second.value is None or second.u is None or predicted.value is None or predicted.u is None:
             continue
-        shares = {name: contributions((one, other), name, symbol) for name in _OF_INSTRUMENTS}
+        shares = {name: contributions((one, other), name, symbol) for name in LENGTHS}
         systematic = sum(
             was**2 - (2.0 * was * now if name in pair.common else 0.0) for name, (was, now) in shares.items()
         )

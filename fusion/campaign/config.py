@@ -758,6 +758,11 @@ class InterferometryTable(_Measured, title="Laser"):
     )
     uncertainty: UncertaintyTable = UncertaintyTable()
 
+    @property
+    def recompensates(self) -> bool:
+        """Whether the environment log enters the readings: compensated again, or corrected for a dead path."""
+        return self.compensation == "redo" or self.dead_path_mm != 0.0
+
     @model_validator(mode="after")
     def _redo_is_requested(self) -> InterferometryTable:
         """Refuse keys that say how a compensation is done again where none is."""

@@ -224,11 +224,6 @@ class LaserInputs(Inputs):
     iso_budget: StatedBudget
     iso_cycles: list[int] | None
 
-    @property
-    def is_recompensated(self) -> bool:
-        """Whether the environment log entered the readings: compensated again, or corrected for a dead path."""
-        return self.interferometry.compensation == "redo" or self.interferometry.dead_path_mm != 0.0
-
 
 @dataclass(frozen=True, kw_only=True)
 class CameraInputs(Inputs):

@@ -15,7 +15,7 @@ from fusion.results.results import Notice
 from interferometry.compensation import SensorUncertainty, air_index, compensate, dead_path_error_um, followed_factor_um
 from interferometry.io.readings import AIR_AND_MATERIAL
 from interferometry.iso230 import Iso230Budget
-from interferometry.iso230.budget import SCATTER_ALONE
+from interferometry.iso230.budget import LENGTHS, SCATTER_ALONE
 
 # The uncertainty budget of a campaign's ISO 230-2 values: what is stated, what was measured, what is assumed.
 
@@ -30,25 +30,17 @@ class StatedBudget:
     origins: Mapping[str, Origin]
 
 
-#: Inputs of a budget of lengths.
-_LENGTHS = ("device", "alignment", "material_temperature", "expansion_coefficient")
-ROTARY_BUDGET = StatedBudget(SCATTER_ALONE, dict.fromkeys(_LENGTHS, "not of a rotary axis"))
+ROTARY_BUDGET = StatedBudget(SCATTER_ALONE, dict.fromkeys(LENGTHS, "not of a rotary axis"))
 
 
 def state_budget(table: InterferometryTable, *, camera_u_K: float | None = None) -> StatedBudget:
     """Return the budget of a campaign, the same for readings as recorded and for those that are compensated again."""
     stated = table.uncertainty
-    coefficient_u = stated.expansion_coefficient_ppm_per_K
-    if coefficient_u is None:
-        coefficient_u = table.expansion_coefficient_u_ppm_per_K
-    given = {
-        "device": ("device_ppm", stated.device_ppm),
-        "alignment": ("alignment_ppm", stated.alignment_ppm),
-        "material_temperature": ("material_temperature_K", stated.material_temperature_K),
-        "expansion_coefficient": ("expansion_coefficient_ppm_per_K", coefficient_u),
-    }
-    origins: dict[str, Origin] = {name: "assumed" if value is None else "stated" for name, (_, value) in given.items()}
-    known = {key: value for key, value in given.values() if value is not None}
+    given = {name: getattr(stated, field) for name, (field, _) in LENGTHS.items()}
+    if given["expansion_coefficient"] is None:
+        given["expansion_coefficient"] = table.expansion_coefficient_u_ppm_per_K
+    origins: dict[str, Origin] = {name: "assumed" if value is None else "stated" for name, value in given.items()}
+    known = {LENGTHS[name][0]: value for name, value in given.items() if value is not None}
     if camera_u_K is not None and stated.material_temperature_K is None:
         known["material_temperature_K"] = camera_u_K
         origins["material_temperature"] = "from the camera"

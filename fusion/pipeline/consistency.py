@@ -88,7 +88,7 @@ def _of_logs(source: Read) -> dict[str, Any]:
         "environment_file": (None if laser is None else laser.environment) or "the environment log",
         "drivers": source.drivers,
         "drivers_file": "the drivers' log" if drivers is None else drivers.file,
-        "recompensated": isinstance(source, LaserInputs) and source.is_recompensated,
+        "recompensated": isinstance(source, LaserInputs) and source.interferometry.recompensates,
     }
 
 

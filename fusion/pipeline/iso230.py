@@ -50,19 +50,13 @@ from interferometry.iso230 import (
     evaluate_other_standards,
     evaluate_windows,
 )
+from interferometry.iso230.budget import LENGTHS
 from interferometry.iso230.conditions import check_conditions
 
 _LAST = f"the last {STANDARD_CYCLES} whole cycles of the test"
 _ONLY = "the only window of the test"
 _CHOSEN = "as chosen"
 _AXIS = (*QUANTITIES, "mean_reversal")
-#: Unit of each input, and the field of `interferometry.iso230.Iso230Budget` that holds it.
-_INPUTS = {
-    "device": ("device_ppm", "ppm"),
-    "alignment": ("alignment_ppm", "ppm"),
-    "material_temperature": ("material_temperature_K", "K"),
-    "expansion_coefficient": ("expansion_coefficient_ppm_per_K", "ppm/K"),
-}
 
 
 def estimate_joint(deviations: xr.Dataset) -> tuple[xr.Dataset | None, tuple[Notice, ...]]:
@@ -186,8 +180,8 @@ def _contribution(
     parts = {f"{symbol}_um": result["contribution"].sel(quantity=symbol, contributor=name) for symbol in _AXIS}
     u: float | None = None
     unit, origin = "um", "from the readings"
-    if name in _INPUTS:
-        field, unit = _INPUTS[name]
+    if name in LENGTHS:
+        field, unit = LENGTHS[name]
         u, origin = getattr(budget.budget, field), budget.origins[name]
         if name == "expansion_coefficient" and not budget.budget.is_scatter_alone:
             logged = "" if material else "an assumed "
@@ -405,7 +399,7 @@ def read_test(path: Path, cycles: str | None) -> StandardTest:
         return _evaluate(campaign.campaign.title, named, *read)
     deviations = read_deviations(path, rotary=True)
     window = None if cycles is None else _window_of(cycles, deviations, path.name)
-    budget = ROTARY_BUDGET if is_rotary(deviations) else StatedBudget(Iso230Budget(), dict.fromkeys(_INPUTS, "assumed"))
+    budget = ROTARY_BUDGET if is_rotary(deviations) else StatedBudget(Iso230Budget(), dict.fromkeys(LENGTHS, "assumed"))
     try:
         return _evaluate(path.name, {path.name: path}, deviations, budget, window)
     except InterferometryError as error:

@@ -676,7 +676,7 @@ class _RunningTest:
                 self._warnings.append("the clock offset is not given: 0 s is taken while the test runs")
         if laser is not None:
             self._laser = ArrivingReadings(campaign.resolve(laser.deviations), reader_of_deviations(campaign), clock)
-            if laser.compensation == "redo" or laser.dead_path_mm or laser.material_temperature == "camera":
+            if laser.recompensates:
                 self._warnings.append("readings are shown as they were written; the full run compensates them")
 
     def look(self, *, final: bool = False) -> list[LiveState]:

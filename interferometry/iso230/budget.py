@@ -6,18 +6,17 @@ from dataclasses import dataclass
 
 from interferometry.common import check_uncertainties
 
-#: Contributions to the uncertainty, in the order of the budget. The last two are the sampling, by which a few cycles stand for the axis:
-#: scatter of the readings, and that the largest of noisy values is too large.
-CONTRIBUTIONS = (
-    "device",
-    "alignment",
-    "material_temperature",
-    "expansion_coefficient",
-    "environmental_variation",
-    "sampling",
-    "extremes",
-)
+#: Inputs of lengths, whose errors are one and the same in all readings of a test: the field of `Iso230Budget` that holds each, its unit.
+LENGTHS = {
+    "device": ("device_ppm", "ppm"),
+    "alignment": ("alignment_ppm", "ppm"),
+    "material_temperature": ("material_temperature_K", "K"),
+    "expansion_coefficient": ("expansion_coefficient_ppm_per_K", "ppm/K"),
+}
+#: The sampling, by which a few cycles stand for the axis: scatter of the readings, and that the largest of noisy values is too large.
 SAMPLING = ("sampling", "extremes")
+#: Contributions to the uncertainty, in the order of the budget.
+CONTRIBUTIONS = (*LENGTHS, "environmental_variation", *SAMPLING)
 
 
 @dataclass(frozen=True)
@@ -78,11 +77,8 @@ class Iso230Budget:
     @property
     def is_scatter_alone(self) -> bool:
         """Whether instrument, alignment and material contribute nothing."""
-        of_material = self.material_temperature_K or self.expansion_coefficient_ppm_per_K
-        return not (self.device_ppm or self.alignment_ppm or of_material)
+        return not any(getattr(self, field) for field, _ in LENGTHS.values())
 
 
 #: No error of instrument, alignment or material, as for a rotary axis: the budget is one of lengths.
-SCATTER_ALONE = Iso230Budget(
-    device_ppm=0.0, alignment_ppm=0.0, material_temperature_K=0.0, expansion_coefficient_ppm_per_K=0.0
-)
+SCATTER_ALONE = Iso230Budget(**{field: 0.0 for field, _ in LENGTHS.values()})

@@ -158,7 +158,7 @@ def measure_emissivity(
             f"region {outline.name}: the two states give an emissivity of {estimate.emissivity:.3g} with a standard uncertainty of "
             f"{u:.2g}, which is not sufficient; check their temperatures, or take states that differ more"
         )
-    return EmissivityEstimate(estimate.emissivity, u, estimate.reflected_temperature_degC, estimate.quality)
+    return replace(estimate, emissivity_u=u)
 
 
 #: Temperatures at which the common uncertainty is evaluated; between them it is interpolated, to better than a thousandth.

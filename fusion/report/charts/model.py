@@ -85,15 +85,11 @@ def plot_significance(maps: xr.Dataset, channel: str) -> Chart:
     _add_blank(drawn, extent, "p > 0.1")
     blank = step == len(_P_STEPS)
     add_cells(drawn, np.where(blank, np.nan, step + 0.5), extent, mapper, [("family-wise p", "@p{0.000}")], p=p)
-    _add_steps(drawn, mapper, "family-wise p", _P_NAMES)
-    return Chart(drawn, _where(maps, p <= ATTRIBUTION_LEVEL, p, ""), _cell_columns(maps, **{"family-wise p": p}))
-
-
-def _add_steps(drawn: figure, mapper: LinearColorMapper, label: str, names: dict[float, str]) -> None:
-    """Put a colour bar with names instead of numbers below a map."""
-    add_colour_bar(drawn, mapper, label)
+    # Names instead of numbers.
+    add_colour_bar(drawn, mapper, "family-wise p")
     (bar,) = (part for part in drawn.below if getattr(part, "color_mapper", None) is mapper)
-    bar.ticker, bar.major_label_overrides = FixedTicker(ticks=list(names)), dict(names)
+    bar.ticker, bar.major_label_overrides = FixedTicker(ticks=list(_P_NAMES)), dict(_P_NAMES)
+    return Chart(drawn, _where(maps, p <= ATTRIBUTION_LEVEL, p, ""), _cell_columns(maps, **{"family-wise p": p}))
 
 
 def _where(maps: xr.Dataset, passed: np.ndarray, p: np.ndarray, more: str) -> str:

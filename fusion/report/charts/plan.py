@@ -55,7 +55,7 @@ def extent_of(cells: xr.Dataset) -> Extent:
     return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
 
-def new_plan(extent: Extent, *, title: str = "", height: int | None = None) -> figure:
+def new_plan(extent: Extent, *, title: str = "") -> figure:
     """Return an empty plan view of the table as the camera sees it: x to the right, y downwards from its origin, which is marked.
 
     ``templates/charts.js`` keeps a millimetre as long in both directions in whatever width the page has.
@@ -63,7 +63,7 @@ def new_plan(extent: Extent, *, title: str = "", height: int | None = None) -> f
     left, right, bottom, top = extent
     ranges: dict[str, Any] = {"x_range": (left, right), "y_range": (top, bottom)}
     # The height for a common width, of which scale and colour bar take their part.
-    height = height or round(min(420.0, 560 * (top - bottom) / (right - left))) + 110
+    height = round(min(420.0, 560 * (top - bottom) / (right - left))) + 110
     drawn = new_figure(x="x / mm", y="y / mm", title=title, height=height, **ranges)
     drawn.name = "plan"
     drawn.grid.grid_line_color = None
