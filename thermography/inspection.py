@@ -117,18 +117,10 @@ def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
 
     Examples
     --------
-    >>> from tempfile import TemporaryDirectory
-    >>> from thermography.io.flir_writer import write_jpeg
-    >>> from thermography.io.frame import CameraParameters
-    >>> sc660 = CameraParameters(
-    ...     0.95, 0.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
-    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
-    ... )
-    >>> with TemporaryDirectory() as folder:
-    ...     write_jpeg(Path(folder, "a.jpg"), np.array([[18000, 18500]], np.uint16), sc660, "2026-03-09T06:33:47")
-    ...     inspection = inspect_file(Path(folder, "a.jpg"))
-    >>> float(inspection.evaluation.columns["mean"][0, 0].round(2)), inspection.warnings[0].message
-    (24.6, 'distance 0 m: the atmosphere is not corrected.')
+    >>> from thermofuse.resources import resource
+    >>> inspection = inspect_file(resource("samples/frame.jpg"))
+    >>> float(inspection.evaluation.columns["mean"][0, 0].round(2)), inspection.warnings
+    (23.55, ())
     """
     path = Path(path)
     references, rejected = index_frames([path])

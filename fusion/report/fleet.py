@@ -20,7 +20,7 @@ import xarray as xr
 
 from fusion.common import FusionError
 from fusion.common.messages import cell
-from fusion.report.charts.fleet import plot_history
+from fusion.report.charts.comparison import plot_history
 from fusion.report.charts.style import Chart, embed
 from fusion.report.exports.tables import Bars, Bound, Linked, conditions_of, write_workbook
 from fusion.report.findings import findings, headline

@@ -97,19 +97,10 @@ def read_frame(path: str | os.PathLike[str]) -> Frame:
 
     Examples
     --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> from thermography.io.flir_writer import write_jpeg
-    >>> from thermography.io.frame import CameraParameters
-    >>> sc660 = CameraParameters(
-    ...     0.95, 1.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
-    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
-    ... )
-    >>> with TemporaryDirectory() as folder:
-    ...     write_jpeg(Path(folder, "a.jpg"), np.full((48, 64), 18000, np.uint16), sc660, "2026-03-09T06:33:47")
-    ...     frame = read_frame(Path(folder, "a.jpg"))
+    >>> from thermofuse.resources import resource
+    >>> frame = read_frame(resource("samples/frame.jpg"))
     >>> frame.counts.shape, str(frame.counts.dtype), frame.parameters.planck_b
-    ((48, 64), 'uint16', 1501.0)
+    ((120, 160), 'uint16', 1501.0)
     """
     path = Path(path)
     with path.open("rb", buffering=0) as file:

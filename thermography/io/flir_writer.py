@@ -93,11 +93,9 @@ def write_jpeg(
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
+    >>> from thermofuse.resources import resource
     >>> from thermography.io.flir import read_frame
-    >>> sc660 = CameraParameters(
-    ...     0.95, 1.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
-    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
-    ... )
+    >>> sc660 = read_frame(resource("samples/frame.jpg")).parameters
     >>> counts = np.full((48, 64), 18000, np.uint16)
     >>> with TemporaryDirectory() as folder:
     ...     write_jpeg(Path(folder, "a.jpg"), counts, sc660, "2026-03-09T06:33:47.125", encoding="png")
@@ -162,11 +160,9 @@ def write_sequence(
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> from thermography.io.flir import index_frames
-    >>> sc660 = CameraParameters(
-    ...     0.95, 1.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
-    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
-    ... )
+    >>> from thermofuse.resources import resource
+    >>> from thermography.io.flir import index_frames, read_frame
+    >>> sc660 = read_frame(resource("samples/frame.jpg")).parameters
     >>> counts = np.full((48, 64), 18000, np.uint16)
     >>> start = np.datetime64("2026-03-09T06:33:47", "ms")
     >>> recording = (Frame(counts=counts, parameters=sc660, time=start + 1000 * second) for second in range(3))

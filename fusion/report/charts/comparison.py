@@ -1,9 +1,9 @@
-"""Charts of a comparison: profiles over one another, what remains of their difference, scatter by position, and the trend over dates."""
+"""Charts of a comparison and of a fleet: profiles over one another, what remains of their difference, scatter, and trends over dates."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -235,3 +235,28 @@ def follow_trends(pairs: Sequence[PairComparison]) -> list[Trend]:
         trend = follow(dates, values, np.sqrt(np.maximum(own, 0.0)), name, unit, stated.get(name))
         trends += [] if trend is None else [trend]
     return trends
+
+
+# A fleet: what the tests of one axis of one machine found over their dates.
+
+
+def plot_history(dates: np.ndarray, found: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Chart:
+    """Draw quantities over the dates of tests with their expanded uncertainties, and from eight tests on their control limits.
+
+    Each is values and standard uncertainties, um, by its symbol.
+    """
+    order = np.argsort(dates, kind="stable")
+    drawn = new_figure(x="date", y=f"{', '.join(found)} / µm", x_type="datetime", height=240)
+    courses = Courses(drawn, {"date": np.datetime_as_string(dates[order], "D")})
+    for (name, (values, u)), colour, marker in zip(found.items(), CATEGORIES, _MARKS, strict=False):
+        value, half = values[order], 2 * np.nan_to_num(u[order])
+        limits = control_limits(value[np.isfinite(value)])
+        told = span_words(value, "µm")
+        if limits is not None:
+            for level, dash in zip(limits, ("dashed", "dotted", "dashed"), strict=True):
+                draw(drawn, "HSpan", y=level, line_color=colour, line_dash=dash, line_width=1.1)
+            beyond = int(((value < limits.low) | (value > limits.high)).sum())
+            told += f", control limits {number(limits.low)} to {number(limits.high)} µm, {beyond} outside"
+        looks = {"half": half, "colour": colour, "marker": marker}
+        courses.add(dates[order], value, name, "", f"U({name}) (k = 2) / µm", seen=told, **looks)
+    return courses.chart(f"{dates.size} tests")
