@@ -679,6 +679,8 @@ class ChainedResult(schema.ChainedPart):
 
     channel_rmse_final_um: Array
     """(channels,) errors of the final model."""
+    rmse_events_um: float
+    """Error of the declared model with the events that were found, um: what the other effects are held against."""
 
 
 @one_thread
@@ -712,11 +714,14 @@ def chain_forward(
         progress(done, len(asked), "predicting part after part")
         problem, state = search_record(record, before, declared, seed=seed, effects=effects)
         hours = record.seconds[part] / 3600.0
+        with_events = [*state.declared, *(term for term in state.added if isinstance(term.candidate, Event))]
         predicted = (
             last_values(record, before),
-            *(problem.predict(terms).predicted for terms in (state.declared, state.model.terms)),
+            *(problem.predict(terms).predicted for terms in (state.declared, with_events, state.model.terms)),
         )
-        last_um, declared_um, final_um = (channel_rmse((record.displacement - one)[part]) for one in predicted)
+        last_um, declared_um, events_um, final_um = (
+            channel_rmse((record.displacement - one)[part]) for one in predicted
+        )
         runs: dict[str, Any] = (
             {"runs": tuple(record.runs[run].name for run in np.unique(record.run[part]))} if record.runs else {}
         )
@@ -731,6 +736,7 @@ def chain_forward(
                 rmse_declared_um=known_mean(declared_um),
                 rmse_final_um=known_mean(final_um),
                 channel_rmse_final_um=final_um,
+                rmse_events_um=known_mean(events_um),
             )
         )
     return parts
@@ -1190,15 +1196,13 @@ def _unseen(
     return parts
 
 
-def withdraw_unreplicated(
-    problem: RecordProblem, state: RecordState, chained: Sequence[schema.ChainedPart]
-) -> RecordState:
-    """Withdraw effects that the same procedure also added on earlier time, and predicted no better with."""
+def withdraw_unreplicated(problem: RecordProblem, state: RecordState, chained: Sequence[ChainedResult]) -> RecordState:
+    """Withdraw effects that the same procedure also added on earlier time, and predicted no better with; events are in both."""
     for place, step in enumerate(state.steps):
         tried = [part for part in chained if part.in_training and step.effect in part.effects]
         if not tried or step.score.is_event:
             continue
-        before = float(known_mean(np.array([part.rmse_declared_um for part in tried])))
+        before = float(known_mean(np.array([part.rmse_events_um for part in tried])))
         after = float(known_mean(np.array([part.rmse_final_um for part in tried])))
         if after >= MAX_ERROR_RATIO_TO_ENTER * before:
             p = step.score.family_wise_p

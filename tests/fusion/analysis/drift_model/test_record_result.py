@@ -27,7 +27,7 @@ from fusion.analysis.drift_model.record import (
 from fusion.analysis.drift_model.record_data import Record, RecordedRun, reduce_record
 from fusion.analysis.drift_model.search import Confirmation, Confirmed, Decision, LoopState, Reason, Round, Score, Step
 from fusion.analysis.effects.effect import Candidate
-from fusion.results.loop import Baselines, ChainedPart, ModelError
+from fusion.results.loop import Baselines, ModelError
 from fusion.twin.recipe import EffectRecipe
 from interferometry.drift.gls import drift_system, fit_fixed_effects
 from tests.fusion.record_tables import record_of, runs_table, searched, twin_table
@@ -109,6 +109,7 @@ def result(*, shape: str = "") -> RecordResult:
                     rmse_declared_um=1.5,
                     rmse_final_um=0.5,
                     channel_rmse_final_um=np.array([0.5, np.nan]),
+                    rmse_events_um=1.5,
                 )
             ],
             rounding=np.zeros((2, 2)),
@@ -341,9 +342,9 @@ def added(*names: str, event_s: float | None = None) -> LoopState[Model]:
     )
 
 
-def part(effects: tuple[str, ...], declared: float, final: float) -> ChainedPart:
-    return ChainedPart.model_construct(
-        in_training=True, effects=effects, rmse_declared_um=declared, rmse_final_um=final
+def part(effects: tuple[str, ...], declared: float, final: float) -> ChainedResult:
+    return ChainedResult.model_construct(
+        in_training=True, effects=effects, rmse_events_um=declared, rmse_final_um=final
     )
 
 
