@@ -1,12 +1,36 @@
-"""Fixtures shared by all tests: real measured files, and a fixed seed for every random generator."""
+"""Fixtures shared by all tests: real measured files, a fixed seed for every random generator, and work that workers share."""
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 from fusion.campaign.remote import DatasetError, fetch_sample
+
+
+def pytest_configure(config):
+    """In a new clone each worker begins with other files, whose bytecode the others find, and compiles kernels for all."""
+    work = getattr(config, "workerinput", None)
+    if work is None:
+        return
+    from numba.core.dispatcher import Dispatcher
+
+    build = config.rootpath / "build"
+    build.mkdir(exist_ok=True)
+    lock, compile_alone = FileLock(build / "compiled.lock"), Dispatcher.compile
+
+    def compile_or_load(self: Dispatcher, signature: Any) -> Any:
+        with lock:
+            return compile_alone(self, signature)
+
+    Dispatcher.compile = compile_or_load
+    if config.args == config.getini("testpaths"):
+        files = sorted((config.rootpath / "tests").rglob("test_*.py"))
+        first = len(files) * int(work["workerid"].removeprefix("gw")) // work["workercount"]
+        config.args = [str(path) for path in files[first:] + files[:first]]
 
 
 @pytest.fixture
@@ -46,8 +70,10 @@ def real_file():
     return find
 
 
-def pytest_collection_modifyitems(items):
-    """Mark what reads the results of a whole run, starts the application or opens a browser."""
+def pytest_collection_modifyitems(config, items):
+    """Mark what reads the results of a whole run, starts the application or opens a browser; files in one order for all workers."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: item.path)
     for item in items:
         fixtures = set(getattr(item, "fixturenames", ()))
         if fixtures & {"results_folder", "app", "states", "sound", "record_results"}:
