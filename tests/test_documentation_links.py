@@ -9,10 +9,12 @@ import importlib.util
 import inspect
 import re
 import subprocess
+from collections.abc import Iterator
 from datetime import date
 from difflib import get_close_matches
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,11 +73,10 @@ def equal(quoted: object, actual: object) -> bool:
     return quoted == actual
 
 
-@pytest.mark.parametrize("document", PAGES, ids=name_of)
-def test_every_quoted_constant_has_the_value_of_the_code(document):
+def test_every_quoted_constant_has_the_value_of_the_code():
     wrong = []
-    for dotted, argument, text in QUOTED.findall(document.read_text(encoding="utf-8")):
-        place = f"{dotted}({argument})" if argument else dotted
+    for page, (dotted, argument, text) in in_pages(QUOTED):
+        place = f"{page}: {dotted}({argument})" if argument else f"{page}: {dotted}"
         try:
             found = resolve(dotted)
             actual = inspect.signature(found).parameters[argument].default if argument else found
@@ -84,20 +85,24 @@ def test_every_quoted_constant_has_the_value_of_the_code(document):
             continue
         if not equal(ast.literal_eval(text), actual):
             wrong.append(f"{place} is {actual!r}, the page says {text}")
-    assert not wrong, f"{name_of(document)}: " + "; ".join(wrong)
+    assert not wrong, "; ".join(wrong)
 
 
-@pytest.mark.parametrize("document", PAGES, ids=name_of)
-def test_every_module_named_in_a_page_exists(document):
+def in_pages(pattern: re.Pattern[str]) -> Iterator[tuple[str, Any]]:
+    """What a pattern finds, with the name of its page."""
+    return ((name_of(page), found) for page in PAGES for found in pattern.findall(page.read_text(encoding="utf-8")))
+
+
+def test_every_module_named_in_a_page_exists():
     missing = []
-    for dotted in sorted(set(re.findall(rf"`({DOTTED})[`(]", document.read_text(encoding="utf-8")))):
+    for page, dotted in sorted(set(in_pages(re.compile(rf"`({DOTTED})[`(]")))):
         if dotted == "fusion.nc":  # a product
             continue
         try:
             resolve(dotted)
         except (ModuleNotFoundError, AttributeError):
-            missing.append(f"{dotted}{near(dotted)}")
-    assert not missing, f"{name_of(document)} names {', '.join(missing)}"
+            missing.append(f"{page} names {dotted}{near(dotted)}")
+    assert not missing, "; ".join(missing)
 
 
 def missing_files(text: str) -> list[str]:
@@ -110,17 +115,18 @@ def missing_files(text: str) -> list[str]:
     return missing
 
 
-@pytest.mark.parametrize("document", PAGES, ids=name_of)
-def test_every_file_and_test_named_in_a_page_exists(document: Path) -> None:
-    text = document.read_text(encoding="utf-8")
-    missing = missing_files(text)
-    missing += [link for link in re.findall(r"\]\(([\w./-]+\.md)", text) if not (document.parent / link).exists()]
-    assert not missing, f"{name_of(document)} names {', '.join(missing)}"
+def test_every_file_and_test_named_in_a_page_exists() -> None:
+    missing = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        links = [link for link in re.findall(r"\]\(([\w./-]+\.md)", text) if not (page.parent / link).exists()]
+        missing += [f"{name_of(page)} names {name}" for name in (*missing_files(text), *links)]
+    assert not missing, "; ".join(missing)
 
 
-@pytest.mark.parametrize("document", PAGES, ids=name_of)
-def test_every_measured_file_of_a_tutorial_is_listed(document):
-    assert set(measured_files(document.read_text(encoding="utf-8"))) <= set(read_registry())
+def test_every_measured_file_of_a_tutorial_is_listed():
+    named = {name for page in PAGES for name in measured_files(page.read_text(encoding="utf-8"))}
+    assert named and named <= set(read_registry())
 
 
 def test_every_page_and_test_cited_in_the_code_exists():

@@ -317,15 +317,15 @@ def test_its_uncertainty_covers_repeated_experiments(rng):
     exact = _states(0.85)
     u = estimate_emissivity(*exact, PARAMETERS).emissivity_u
     estimates = []
-    for _ in range(4000):
+    for _ in range(1000):
         drawn = [
             KnownState(s.counts + rng.normal(0, s.counts_u), s.counts_u, s.temperature_degC + rng.normal(0, 0.2), 0.2)
             for s in exact
         ]
         estimates.append(estimate_emissivity(*drawn, PARAMETERS).emissivity)
-    # A standard deviation of 4000 draws scatters by 1.1 %.
-    assert np.std(estimates, ddof=1) == pytest.approx(u, rel=0.05)
-    assert np.mean(estimates) == pytest.approx(0.85, abs=4 * u / np.sqrt(4000) + 1e-3)
+    # A standard deviation of 1000 draws scatters by 2.2 %.
+    assert np.std(estimates, ddof=1) == pytest.approx(u, rel=0.09)
+    assert np.mean(estimates) == pytest.approx(0.85, abs=4 * u / np.sqrt(1000) + 1e-3)
 
 
 def test_estimates_are_classed_and_what_determines_nothing_is_refused():

@@ -488,19 +488,6 @@ def test_a_dead_cell_explains_nothing_and_a_copy_of_the_drift_all_but_rounding(p
     assert screening.sensitivity[3, 2] == pytest.approx(1.0, rel=1e-4)
 
 
-def test_the_screen_keeps_its_level_on_independent_walks():
-    flagged = 0
-    for seed in range(40):
-        rng = np.random.default_rng([seed, 3])
-        film = np.cumsum(rng.standard_normal((60, 40)), axis=0)
-        values = np.cumsum(rng.standard_normal((4, 60)), axis=1) + 0.3 * rng.standard_normal((4, 60))
-        centred = FieldSeries(SECONDS, film - film.mean(axis=0))
-        screening = screen(series_of(values), centred, VARIED, permutations=99, rng=rng)
-        flagged += bool((screening.p_value <= 0.05).any())
-    # 7 or more of 40 at a rate of 0.05 has probability 0.003.
-    assert flagged <= 6
-
-
 def test_a_missing_value_has_no_weight(problem_per_target):
     values, film = problem_per_target
     holes = values.copy()

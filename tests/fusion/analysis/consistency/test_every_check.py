@@ -258,6 +258,10 @@ LIES: dict[str, Lie] = {
 
 #: What the evidence of a lie must say: its number, place or file.
 SAID = {
+    "copied_cycles": "Cycles 20 and 21 agree digit for digit.",
+    "copied_targets": "Targets 7 and 8 agree",
+    "repeated_value": " µm, the largest",
+    "target_order": "with the targets of one approach read from the other end",
     "travel_order": "In 40 of 40 cycles, first in cycle 1, the readings labelled positive were taken at falling",
     "fiducials_found": "5 of the 12 fiducials of fiducials.csv",
     "fiducials_unchecked": "If F1, F3 were elsewhere than fiducials.csv says",

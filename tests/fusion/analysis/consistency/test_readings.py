@@ -102,30 +102,6 @@ def test_sound_tests_of_other_machines_pass(
         assert [check for check in run_checks("source", Inputs(linear=test)) if not check.passed] == []
 
 
-def test_a_cycle_that_was_copied_is_named() -> None:
-    test = sound()
-    values = test["deviation"].values.copy()
-    values[20] = values[19]
-    named = failed(with_deviation(test, values))
-    assert set(named) == {"copied_cycles"}
-    assert named["copied_cycles"].evidence == "Cycles 20 and 21 agree digit for digit."
-
-
-def test_a_target_that_holds_the_values_of_its_neighbour_is_named() -> None:
-    test = sound()
-    values = test["deviation"].values.copy()
-    values[:, :, 7] = values[:, :, 6]
-    named = failed(with_deviation(test, values))
-    assert set(named) == {"copied_targets"} and "Targets 7 and 8 agree" in named["copied_targets"].evidence
-
-
-def test_readings_cut_off_at_one_value_are_named_with_it() -> None:
-    test = sound()
-    limit_um = float(np.quantile(test["deviation"], 0.7).round(3))
-    named = failed(with_deviation(test, np.minimum(test["deviation"].values, limit_um).round(4)))
-    assert f"{limit_um:g} µm, the largest" in named["repeated_value"].evidence
-
-
 @pytest.mark.parametrize("late", [1, -1])
 def test_a_missed_trigger_is_named_with_its_first_cycle(late: int) -> None:
     """In the order of travel, so that the approaches shift against each other; the reading that falls out of a pass is the next one's."""
@@ -353,16 +329,6 @@ def test_inverted_signs_are_named_with_their_place(place: tuple, words: str) -> 
     found = failed_signs(inverted(place))
     assert list(found) == ["mirrored_readings"]
     assert words in found["mirrored_readings"].evidence
-
-
-def test_targets_of_one_approach_numbered_from_the_other_end_are_named() -> None:
-    test = sloped()
-    values = test["deviation"].values.copy()
-    values[:, 1] = values[:, 1, ::-1]
-    found = failed_signs(with_deviation(test, values))
-    assert list(found) == ["target_order"]
-    assert "with the targets of one approach read from the other end" in found["target_order"].evidence
-    assert "ISO 230-2 values" in found["target_order"].endangers
 
 
 def test_a_step_cycle_and_readings_without_times_are_no_contradiction() -> None:

@@ -29,9 +29,9 @@ def contrast_with_white(colour: str) -> float:
     return 1.05 / (float(linear @ [0.2126, 0.7152, 0.0722]) + 0.05)
 
 
-@pytest.mark.parametrize("colour", [*style.CATEGORIES, style.BEFORE, *style.ordered_colours(60)])
-def test_every_line_is_readable_on_white(colour):
-    assert contrast_with_white(colour) >= 3.0  # WCAG 2.2, 1.4.11
+def test_every_line_is_readable_on_white():
+    for colour in (*style.CATEGORIES, style.BEFORE, *style.ordered_colours(60)):
+        assert contrast_with_white(colour) >= 3.0, colour  # WCAG 2.2, 1.4.11
 
 
 def test_a_chart_lets_the_page_scroll_and_names_axes_bands_and_colours():
