@@ -71,12 +71,15 @@ def real_file():
 
 
 def pytest_collection_modifyitems(config, items):
-    """Mark what reads the results of a whole run, starts the application or opens a browser; files in one order for all workers."""
-    if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: item.path)
+    """Mark what reads the results of a whole run, starts the application or opens a browser; workers begin with the long files."""
     for item in items:
         fixtures = set(getattr(item, "fixturenames", ()))
         if fixtures & {"results_folder", "app", "states", "sound", "record_results"}:
             item.add_marker("chain")
         if fixtures & {"new_page", "opened"}:
             item.add_marker("browser")
+    if hasattr(config, "workerinput"):
+        long = {
+            item.path for item in items if {mark.name for mark in item.iter_markers()} & {"long", "chain", "browser"}
+        }
+        items.sort(key=lambda item: (item.path not in long, item.path))
