@@ -141,7 +141,7 @@ class Campaign:
     ----------
     profile_um : (approach, target), without any drift
     drift_um, noise_um : drift (declared effects included) and noise of every reading
-    sigma_um : (approach, target), standard deviation of the noise at the start of the test
+    scatter_um : (approach, target), standard deviation of the noise over the test
     undeclared_um : the part of the drift that no declared effect holds
     table_K : (frame,), mean rise of the table, K
     """
@@ -155,7 +155,7 @@ class Campaign:
     drift_um: Array
     undeclared_um: Array
     noise_um: Array
-    sigma_um: Array
+    scatter_um: Array
     table_K: Array
 
 
@@ -168,13 +168,13 @@ def times_s(machine: Machine) -> Array:
 
 
 def readings_noise(machine: Machine, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return the noise of every reading (um) and its standard deviation at every site (um)."""
+    """Return the noise of every reading (um) and its standard deviation over the test at every site (um)."""
     noise = NOISES[machine.noise](rng, (machine.cycles, 2, machine.targets))
     # The second approach meets the targets in the opposite order.
     noise[:, 1] = noise[:, 1, ::-1]
     sigma = machine.noise_um * np.exp(machine.unequal * rng.standard_normal((2, machine.targets)))
     growth = 1.0 + machine.growing * np.linspace(0.0, 1.0, machine.cycles)
-    return noise * sigma * growth[:, None, None], sigma
+    return noise * sigma * growth[:, None, None], sigma * np.sqrt(np.mean(growth**2))
 
 
 def measure(machine: Machine, rng: np.random.Generator) -> Campaign:

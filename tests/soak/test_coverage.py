@@ -1,4 +1,4 @@
-"""Coverage of what is printed with ± of profile, reversal, drift and coefficients, by a simulator of its own: docs/method/coverage.md.
+"""Coverage of what is printed with ± of profile, reversal, drift, scatter and coefficients, by an own simulator: docs/method/coverage.md.
 
 Every figure: the share of errors within 2 u (0.954 of normal errors), and the root mean square of the errors over that of u, 1 where u is
 honest.
@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
@@ -31,15 +32,20 @@ ALONE = Machine(expansion_ppm_per_K=0.0, shift_um_per_K=0.0)
 
 
 def errors(campaign: Campaign) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Errors of the joint estimate and their standard uncertainty, um."""
+    """Errors of the joint estimate and their standard uncertainty, um; of the scatter, in normal deviates of its chi-square limits."""
     found = estimate_drift(campaign.deviations)
     # The profile is that of the average over the measured cycles, from which the drift is counted as well.
     state = campaign.drift_um.mean(axis=(0, 1))
     profile = campaign.profile_um + state
+    freedom, ratio = found["scatter_freedom"].values, found["scatter"].values / campaign.scatter_um
     return {
         "profile": (found["profile"].values - profile, found["profile_u"].values),
         "reversal": (found["reversal"].values - profile[0] + profile[1], found["reversal_u"].values),
         "drift": (found["drift"].values - campaign.drift_um + state, found["drift_u"].values),
+        "scatter": (
+            np.clip(stats.norm.ppf(stats.chi2.cdf(freedom * ratio**2, freedom)), -9.0, 9.0),
+            np.ones(ratio.shape),
+        ),
     }
 
 
