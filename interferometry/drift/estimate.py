@@ -55,30 +55,27 @@ def component_loadings(
 
 # Shape along the axis of a drift that shift, stretch and bend do not describe, from the readings themselves.
 
-#: Level at which a common motion of the targets is a shape; along the course of the drift that is known there is one, and it is looked for
-#: at a level of its own.
-SHAPE_LEVEL, COURSE_LEVEL = 0.01, 0.02
+#: Level at which a common motion of the targets is a shape: along any course, and along the one course of what goes on in one direction.
+SHAPE_LEVEL, TREND_LEVEL = 0.01, 0.02
 #: Least number of targets that take part in a shape (inverse participation ratio): fewer are positions that move by themselves.
 LEAST_TARGETS = 3.5
-#: Fewest cycles in which a shape is looked for along any course, and along that of the known drift.
-SHORTEST_TEST_CYCLES, SHORTEST_COURSE_CYCLES = 15, 8
+#: Fewest cycles in which a shape is looked for along any course, and along a trend.
+SHORTEST_TEST_CYCLES, SHORTEST_TREND_CYCLES = 15, 8
 _PERMUTATIONS = 199
 _SEED = 0
 #: Shares that a cycle keeps from the one before it in the courses that are looked for: a rhythm of few cycles, and a warm-up.
 _KEPT = (0.1, 0.85)
 
 
-def common_shape(residual: Array, known: Array, course: Array) -> Array | None:
-    """Return the shape along the axis of a motion over the cycles that the known shapes leave, if any: one along the course of the known
-    drift (cycles,), as of a part that warms with the others, or along another one.
-    """
+def common_shape(residual: Array, known: Array) -> Array | None:
+    """Return the shape along the axis of a motion over the cycles that the known shapes leave, if any."""
     cycles, targets = residual.shape
-    if cycles < SHORTEST_COURSE_CYCLES or targets < known.shape[1] + 2:
+    if cycles < SHORTEST_TREND_CYCLES or targets < known.shape[1] + 2:
         return None
     remainder = _without(residual, known)
-    memory = _memory(remainder)
-    whitened, steps = (_without_memory(values, memory) for values in (remainder, course))
-    tried = [(np.outer(steps - steps.mean(), steps - steps.mean()), COURSE_LEVEL)]
+    whitened = _without_memory(remainder, _memory(remainder))
+    trend = np.arange(cycles) - 0.5 * (cycles - 1)
+    tried = [(np.outer(trend, trend), TREND_LEVEL)]
     if cycles >= SHORTEST_TEST_CYCLES:
         tried += [(_succession(cycles, kept), SHAPE_LEVEL / len(_KEPT)) for kept in _KEPT]
     for weights, level in tried:
@@ -424,12 +421,7 @@ def _missing_shape(joint: JointFit) -> Array | None:
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.bincount(cell, weight * joint.fit.residual(), minlength=total.size) / total
     known = joint.loadings(np.zeros(positions.size), positions)
-    # Course of the drift that is known: the first principal component over the cycles.
-    levels = joint.fit.system.smooth(joint.fit.residual()[:, None]).levels[:, :, 0]
-    levels = levels + readings["seconds"].values[:, None] / 3600.0 * _rates(joint, joint.fit.coefficients)
-    moved = np.array([levels[cycle.ravel() == one].mean(axis=0) for one in range(cycles.size)]) @ known.T
-    course = np.linalg.svd(moved - moved.mean(axis=0), full_matrices=False)[0][:, 0]
-    return common_shape(mean.reshape(cycles.size, -1), known[:, (known != 0).any(axis=0)], course)
+    return common_shape(mean.reshape(cycles.size, -1), known[:, (known != 0).any(axis=0)])
 
 
 def _missing_components(joint: JointFit) -> tuple[str, ...]:
