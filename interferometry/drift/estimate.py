@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import sparse, special
 
 from interferometry.common import DIRECTIONS, Array, InterferometryError, check_dataset, one_thread
 from interferometry.deviations import DIMS, OUTLIER, ROUNDING, set_flag, sort_readings
@@ -258,7 +258,7 @@ def scatter_limits(scatter: Array, freedom: Array, sigma: float) -> Array:
     that is nothing beside the uncertainty of the drift, the upper limit is that of the common one.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = (np.sqrt(freedom / special.chdtri(freedom, tail)) for tail in (0.025, 0.975))
+        low, high = (np.sqrt(freedom / scipy.special.chdtri(freedom, tail)) for tail in (0.025, 0.975))
     return np.stack([scatter * low, np.where(scatter == 0.0, sigma, scatter) * high])
 
 
@@ -393,7 +393,7 @@ def _fit(
     if shapes is None:
         shapes = np.empty((np.unique(position).size, 0))
     loadings = _loadings(readings, components, shapes, readings["sign"].values.astype(float), position)
-    design = sparse.csr_array((np.ones(cell.size), (np.arange(cell.size), cell)), shape=(cell.size, len(cells)))
+    design = scipy.sparse.csr_array((np.ones(cell.size), (np.arange(cell.size), cell)), shape=(cell.size, len(cells)))
     seconds, deviation = readings["seconds"].values, readings["deviation"].values
     fit = estimate(
         seconds,
@@ -484,7 +484,7 @@ class _StateDrift:
 
 def _drift_at_state(joint: JointFit, weights: Array) -> _StateDrift:
     fit = joint.fit
-    columns = sparse.hstack([fit.residual()[:, None], fit.design], format="csr")
+    columns = scipy.sparse.hstack([fit.residual()[:, None], fit.design], format="csr")
     average, covariance, with_drift = average_drift(fit.system, weights, columns)
     hours = float(weights @ (fit.system.seconds / 3600.0))
     per_coefficient = hours * _rates(joint, np.eye(fit.coefficients.size)) - average[:, 1:]
@@ -655,7 +655,7 @@ def _scatter(joint: JointFit, standardised: Array, square: Array, worth: Array) 
     cells = len(joint.cells)
     # Median absolute deviation from zero, the expectation of a residual, as a normal standard deviation.
     medians = [np.median(np.abs(standardised[joint.cell == cell])) for cell in range(cells)]
-    typical = np.array(medians) / special.ndtri(0.75)
+    typical = np.array(medians) / scipy.special.ndtri(0.75)
     kept = (np.abs(standardised) <= OUTLIER_LIMIT * np.maximum(typical, 1.0)[joint.cell]) & (worth > 0.0)
     count = np.bincount(joint.cell[kept], minlength=cells)
     squares = np.bincount(joint.cell[kept], square[kept], minlength=cells)
@@ -668,7 +668,7 @@ def _scatter(joint: JointFit, standardised: Array, square: Array, worth: Array) 
 def _excess_variance(scatter: Array, freedom: Array, joint: JointFit) -> Array:
     """Return what cells that scatter clearly more than the common sigma add to the variance of their profile value, um2."""
     ratio = np.nan_to_num(scatter / joint.fit.sigma) ** 2
-    clear = special.chdtrc(np.maximum(freedom, 1.0), ratio * freedom) < EXCESS_LEVEL
+    clear = scipy.special.chdtrc(np.maximum(freedom, 1.0), ratio * freedom) < EXCESS_LEVEL
     readings = np.bincount(joint.cell, minlength=len(joint.cells))
     return np.where(clear, (ratio - 1.0) * joint.fit.sigma**2 / readings, 0.0)
 

@@ -30,8 +30,6 @@ from typing import TypeAlias
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy import linalg, sparse, special
-from scipy.linalg import lapack
 
 from interferometry.common import Array
 from interferometry.drift.kalman import (
@@ -221,13 +219,13 @@ def log_likelihoods(fit: DriftFit, ratios: Array) -> Array:
 
 
 #: Columns of a design; those of very many sites are held by the readings that have them.
-Design: TypeAlias = "Array | sparse.csr_array"
+Design: TypeAlias = "Array | scipy.sparse.csr_array"
 
 
 def _beside(design: Design, columns: Array) -> Design:
     """Return a design with further columns."""
-    if sparse.issparse(design):
-        return sparse.csr_array(sparse.hstack([design, columns]))
+    if scipy.sparse.issparse(design):
+        return scipy.sparse.csr_array(scipy.sparse.hstack([design, columns]))
     return np.column_stack([design, columns])
 
 
@@ -244,7 +242,7 @@ class _Problem:
     response: Array
     design: Design
     columns: Array
-    few: sparse.csr_array | None
+    few: scipy.sparse.csr_array | None
     place: NDArray[np.int64]
     least: Array
 
@@ -253,12 +251,12 @@ class _Problem:
         few, place = None, np.arange(1 + design.shape[1])
         own = place[:0]
         if design.shape[1] >= MANY_COLUMNS:
-            by_column = sparse.csc_array(design)
+            by_column = scipy.sparse.csc_array(design)
             own = np.flatnonzero(np.diff(by_column.indptr) < _FEW_READINGS * design.shape[0])
         if own.size >= MANY_COLUMNS:
             others = np.setdiff1d(place[:-1], own)
             columns = np.column_stack([response, by_column[:, others].toarray()])
-            few = sparse.csr_array(by_column[:, own])
+            few = scipy.sparse.csr_array(by_column[:, own])
             place[np.r_[0, 1 + others, 1 + own]] = np.arange(place.size)
         else:
             columns = np.column_stack([response, _dense(design)])
@@ -315,15 +313,15 @@ def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
 def _sweep(gram: Array) -> tuple[Array, float, int]:
     """Sweep a scaled Gram matrix as `sweep` does; one of many columns by its Cholesky factor, which takes a tenth of the time."""
     if gram.shape[0] >= MANY_COLUMNS:
-        lower, failed = lapack.dpotrf(gram[1:, 1:], lower=1)
+        lower, failed = scipy.linalg.lapack.dpotrf(gram[1:, 1:], lower=1)
         pivots = np.diag(lower) ** 2
         if not failed and pivots.min() >= _DEPENDENCE_TOLERANCE:
-            inverse, _ = lapack.dpotri(lower, lower=1)
+            inverse, _ = scipy.linalg.lapack.dpotri(lower, lower=1)
             inverse = np.tril(inverse) + np.tril(inverse, -1).T
-            along = linalg.solve_triangular(lower, gram[1:, 0], lower=True)
+            along = scipy.linalg.solve_triangular(lower, gram[1:, 0], lower=True)
             swept = np.empty_like(gram)
             swept[0, 0], swept[0, 1:], swept[1:, 1:] = gram[0, 0] - along @ along, 0.0, inverse
-            swept[1:, 0] = linalg.solve_triangular(lower, along, lower=True, trans="T")
+            swept[1:, 0] = scipy.linalg.solve_triangular(lower, along, lower=True, trans="T")
             return swept, float(np.log(pivots).sum()), -1
     return sweep(gram, _DEPENDENCE_TOLERANCE)
 
@@ -397,8 +395,8 @@ def _for_search(system: DriftSystem, problem: _Problem, enough: int | None = Non
     """Return the readings by which the variances of the drift are searched for: all, or those of some of very many sites."""
     if problem.design.shape[1] <= _LEAST_SITES:
         return system, problem
-    by_column = sparse.csc_array(problem.design)
-    own = sparse.csr_array(by_column[:, np.diff(by_column.indptr) < problem.design.shape[0] / _LEAST_SITES])
+    by_column = scipy.sparse.csc_array(problem.design)
+    own = scipy.sparse.csr_array(by_column[:, np.diff(by_column.indptr) < problem.design.shape[0] / _LEAST_SITES])
     each = system.seconds.size / max(own.shape[1], 1)
     most = _MOST_SITES if enough is None else int(np.clip(enough / each, _LEAST_SITES, _MOST_SITES))
     if own.shape[1] <= most:
@@ -477,7 +475,7 @@ def _is_white(innovations: Array) -> bool:
     centred = centred - centred.mean()
     lagged = np.array([centred[lag:] @ centred[:-lag] for lag in range(1, _WHITE_LAGS + 1)]) / (centred @ centred)
     statistic = n * (n + 2.0) * float((lagged**2 / (n - np.arange(1.0, _WHITE_LAGS + 1))).sum())
-    return bool(special.chdtrc(_WHITE_LAGS, statistic) > _WHITE_LEVEL)
+    return bool(scipy.special.chdtrc(_WHITE_LAGS, statistic) > _WHITE_LEVEL)
 
 
 def _fit_memory(fit: DriftFit) -> DriftFit:
@@ -684,7 +682,7 @@ def von_neumann_p_value(series: Array) -> float:
     centred = series - series.mean()
     ratio = float((np.diff(series) ** 2).sum() / (centred**2).sum())
     deviation = np.sqrt(4.0 * (n - 2.0) / (n**2 - 1.0))
-    return float(special.ndtr((ratio - 2.0) / deviation))
+    return float(scipy.special.ndtr((ratio - 2.0) / deviation))
 
 
 # Memory of the noise over the cycles that all positions have alike.
@@ -772,7 +770,7 @@ def _lag_one(values: Array) -> float:
     own = values - values.mean(axis=1, keepdims=True)
     of_cycles = own.shape[1] <= own.shape[0]
     gram = own.T @ own if of_cycles else own @ own.T
-    patterns = linalg.eigh(gram, subset_by_index=[len(gram) - _COMMON_PATTERNS, len(gram) - 1])[1]
+    patterns = scipy.linalg.eigh(gram, subset_by_index=[len(gram) - _COMMON_PATTERNS, len(gram) - 1])[1]
     own -= (own @ patterns) @ patterns.T if of_cycles else patterns @ (patterns.T @ own)
     squares = (own**2).sum(axis=1)
     own, squares = own[squares > 0], squares[squares > 0]
@@ -790,7 +788,7 @@ def typical_memory(values: Array) -> Autoregression:
     typical = np.array([np.median((rows[:, lag:] * rows[:, : cycles - lag]).sum(axis=1) / squares) for lag in lags])
     best, chosen = 0.0, NO_MEMORY
     for order in range(1, MOST_MEMORY_CYCLES + 1):
-        weights = linalg.solve_toeplitz(typical[:order], typical[1 : order + 1])
+        weights = scipy.linalg.solve_toeplitz(typical[:order], typical[1 : order + 1])
         share = 1.0 - float(weights @ typical[1 : order + 1])
         if share <= 0.0 or weights.sum() >= 1.0:
             continue

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
 
 from interferometry.common import Array, InterferometryError
 from thermofuse.compiled import njit
@@ -584,7 +584,7 @@ class DriftSystem:
             gram += whitened.T @ whitened
         return gram, 2.0 * float(np.log(whitening.roots[self.observed]).sum())
 
-    def sparse_normal_equations(self, dense: Array, few: sparse.csr_array) -> tuple[Array, float]:
+    def sparse_normal_equations(self, dense: Array, few: scipy.sparse.csr_array) -> tuple[Array, float]:
         """The same of dense columns (n, q), and after them of columns (n, p) that few readings have, in less time and memory."""
         whitening = self.whitening(dense.shape[1])
         roots, q = whitening.roots, dense.shape[1]

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy.special import fdtrc
 
 from interferometry.drift.planning import Settling, spacing_warnings
 from interferometry.iso230.evaluation import STANDARD_CYCLES
@@ -151,7 +151,7 @@ def _change_within(window: xr.Dataset) -> tuple[float, float]:
     about = values - values.mean(axis=0) - np.outer(step, slope)
     explained, degrees = slope @ slope * (step @ step) / series, series * (cycles - 2)
     scatter = float(np.sum(about**2)) / degrees
-    p_value = float(fdtrc(series, degrees, explained / scatter)) if scatter > 0.0 else 1.0
+    p_value = float(scipy.special.fdtrc(series, degrees, explained / scatter)) if scatter > 0.0 else 1.0
     return float(np.abs(slope).max()) * (cycles - 1), p_value
 
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import special
 
 from interferometry.common import InterferometryError, check_dataset
 from interferometry.compensation import REFERENCE_TEMPERATURE_DEGC
@@ -331,7 +331,11 @@ def _reversal_of_scatter(s: np.ndarray, count: np.ndarray) -> float:
     """Return the B that scatter alone gives in half of such tests, um."""
     variance = (s**2 / np.fmax(count, 1)).sum(axis=0)
     both = variance[np.isfinite(variance)]
-    return float(special.ndtri((1.0 + 0.5 ** (1.0 / both.size)) / 2.0) * np.sqrt(both.mean())) if both.size else np.nan
+    return (
+        float(scipy.special.ndtri((1.0 + 0.5 ** (1.0 / both.size)) / 2.0) * np.sqrt(both.mean()))
+        if both.size
+        else np.nan
+    )
 
 
 # Other evaluations of the same readings: VDI/DGQ 3441 and the Japanese practice of JIS B 6330.

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import special
 
 from interferometry.common import Array
 from interferometry.iso230.budget import CONTRIBUTIONS, Iso230Budget
@@ -182,7 +182,7 @@ def _typical(s: Array, freedom: Array) -> Array:
         return s
     pooled = np.sqrt(np.average(s[known] ** 2, weights=freedom[known]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        own = special.chdtrc(freedom, freedom * (s / pooled) ** 2) < _EXCESS_LEVEL
+        own = scipy.special.chdtrc(freedom, freedom * (s / pooled) ** 2) < _EXCESS_LEVEL
     return np.where(known & ~own, pooled, s)
 
 
@@ -233,6 +233,6 @@ def _drawn_together(values: Array, u: Array) -> Array:
         return values
     centre, spread = values[known].mean(), values[known].var(ddof=1)
     freedom = known.sum() - 1
-    by_scatter = float((u[known] ** 2).mean() * special.chdtri(freedom, 0.05) / freedom)
+    by_scatter = float((u[known] ** 2).mean() * scipy.special.chdtri(freedom, 0.05) / freedom)
     share = max(1.0 - by_scatter / spread, 0.0) if spread > 0 else 0.0
     return centre + np.sqrt(share) * (values - centre)

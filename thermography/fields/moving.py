@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
 
 from thermofuse.compiled import njit
 from thermofuse.resources import variables
@@ -59,7 +59,7 @@ class Samples:
     points_mm: Array
     valid: NDArray[np.bool_]
     coverage: Array
-    centring: sparse.csr_array
+    centring: scipy.sparse.csr_array
     grid: PlanGrid
 
 

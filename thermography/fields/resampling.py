@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
 
 from thermofuse.compiled import njit
 from thermography.common import Array, ThermographyError
@@ -33,8 +33,8 @@ class PlanWeights:
     cell (y, x) that is seen unmasked.
     """
 
-    areas: sparse.csr_array
-    centring: sparse.csr_array
+    areas: scipy.sparse.csr_array
+    centring: scipy.sparse.csr_array
     window: tuple[slice, slice]
     coverage: Array
     grid: PlanGrid
@@ -68,17 +68,17 @@ class PlanWeights:
 
         def factor(line: Array, count: int) -> Array:
             shares = (self.areas.data, line, self.areas.indptr)
-            return self._variance(sparse.csr_array(shares, shape=(self.areas.shape[0], count), copy=True))
+            return self._variance(scipy.sparse.csr_array(shares, shape=(self.areas.shape[0], count), copy=True))
 
         return factor(place // columns, rows), factor(place % columns, columns)
 
-    def _variance(self, shares: sparse.csr_array) -> Array:
+    def _variance(self, shares: scipy.sparse.csr_array) -> Array:
         """Variance of every cell, (y, x), from the shares in it of independent parts of the picture of unit variance."""
         shares.sum_duplicates()
         variance = _row_squares(shares)
         moved = np.flatnonzero(np.diff(self.centring.indptr))
         if moved.size:
-            variance[moved] = _row_squares(sparse.csr_array(shares[moved] + self.centring[moved] @ shares))
+            variance[moved] = _row_squares(scipy.sparse.csr_array(shares[moved] + self.centring[moved] @ shares))
         return self._on_plan(variance)
 
     def resample(self, values: Array, clipped: NDArray[np.bool_] | None = None) -> Array:
@@ -105,9 +105,9 @@ class PlanWeights:
         return np.where(self.coverage >= LEAST_COVERAGE, cells.reshape(self.grid.shape), np.nan)
 
 
-def _row_squares(matrix: sparse.csr_array) -> Array:
+def _row_squares(matrix: scipy.sparse.csr_array) -> Array:
     """Sum of the squares of every row."""
-    squares = sparse.csr_array((matrix.data**2, matrix.indices, matrix.indptr), shape=matrix.shape)
+    squares = scipy.sparse.csr_array((matrix.data**2, matrix.indices, matrix.indptr), shape=matrix.shape)
     return squares @ np.ones(matrix.shape[1])
 
 
@@ -145,7 +145,7 @@ def plan_weights(
     order = np.argsort(cell.astype(np.uint16) if cells <= 1 << 16 else cell, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=cells))])
     shape = (cells, (window[0].stop - window[0].start) * window[1].stop)
-    areas = sparse.csr_array(((area / seen_area[cell])[order], pixel[order], starts), shape=shape)
+    areas = scipy.sparse.csr_array(((area / seen_area[cell])[order], pixel[order], starts), shape=shape)
     return PlanWeights(areas, centring_matrix(offset, coverage, grid), window, coverage, grid)
 
 
@@ -299,7 +299,7 @@ def _add_piece(pieces: _Pieces, first: int, count: int, cell: int, number: int, 
     return count
 
 
-def centring_matrix(offset_mm: Array, coverage: Array, grid: PlanGrid) -> sparse.csr_array:
+def centring_matrix(offset_mm: Array, coverage: Array, grid: PlanGrid) -> scipy.sparse.csr_array:
     """Correction that moves partly seen cells from the centre of their seen area to their own centre."""
     centres_mm = offset_mm + grid.centres_mm.reshape(-1, 2)
     seen = coverage.ravel() >= LEAST_COVERAGE
@@ -307,7 +307,7 @@ def centring_matrix(offset_mm: Array, coverage: Array, grid: PlanGrid) -> sparse
     rows, columns, weights = _centring_entries(
         np.flatnonzero(off_centre), offset_mm, centres_mm, coverage.ravel(), grid.shape, grid.cell_size_mm
     )
-    return sparse.csr_array((weights, (rows, columns)), shape=(seen.size, seen.size))
+    return scipy.sparse.csr_array((weights, (rows, columns)), shape=(seen.size, seen.size))
 
 
 @njit(nogil=True)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import special
 
 from thermography.common import MAD_TO_SIGMA, Array, ThermographyError, scatter_by_median
 from thermography.registration.plan import Fiducial, PlanGrid
@@ -332,7 +332,7 @@ def _blurred_ellipse(columns: Array, rows: Array, shape: Array, spread_px: float
     by_row = np.exp(-(below**2) / 2) * (height * np.cos(angles) * np.sqrt(np.pi / 2) / count / spread_px)
     ends = [((middle + sign * chord)[:, None] - columns) / spread_px for sign in (1.0, -1.0)]
     (right, left), densities = ends, [np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) for end in ends]
-    by_column = special.ndtr(right) - special.ndtr(left)
+    by_column = scipy.special.ndtr(right) - scipy.special.ndtr(left)
     aside = by_row @ ((densities[0] - densities[1]) / spread_px)
     along = (by_row * below / spread_px) @ by_column
     wider = (by_row * (below**2 - 1)) @ by_column - by_row @ (right * densities[0] - left * densities[1])

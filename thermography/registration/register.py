@@ -10,8 +10,8 @@ from math import comb, inf, log10
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import special
 
 from thermography.common import Array, ThermographyError
 from thermography.registration.discs import (
@@ -140,7 +140,7 @@ def _passes(observations: DiscObservations, agreeing: NDArray[np.bool_], fit: Di
     # An agreeing disc is held against the scatter of the others: its own share of the chi-square is taken out.
     others = np.where(agreeing, np.maximum((factor * freedom - squares) / max(freedom - 2, 1), 1.0), factor)
     degrees = np.where(agreeing, max(freedom - 2, 1), max(freedom, 1))
-    unlikely = squares / 2 / others > special.fdtri(2, degrees, 1.0 - _FALSE_ALARM / len(squares))
+    unlikely = squares / 2 / others > scipy.special.fdtri(2, degrees, 1.0 - _FALSE_ALARM / len(squares))
     missed = np.linalg.solve(fit.projection.jacobian(observations.centres_mm), errors[..., None])[..., 0]
     missed_mm = np.linalg.norm(missed, axis=1)
     # Where the others alone determine the fit and no more, nothing tells whether an agreeing disc is wrong.
@@ -952,7 +952,7 @@ def _registration(
     residual = np.linalg.norm(observations.residuals_mm(projection), axis=1)
     factor, freedom = fit.variance_factor()
     # Half-width of Student's t that holds 68 %: few residuals tell their scatter badly (JCGM 100:2008, annex G).
-    factor_u = factor * (float(special.stdtrit(freedom, special.ndtr(1.0))) ** 2 if freedom >= 1.0 else 1.0)
+    factor_u = factor * (float(scipy.special.stdtrit(freedom, scipy.special.ndtr(1.0))) ** 2 if freedom >= 1.0 else 1.0)
     px_per_mm = projection.px_per_mm(observations.centres_mm)
     # Four places have nothing that checks them: each may err unnoticed by up to its diameter, rectangular (JCGM 100:2008, 4.3.7).
     reach_mm = np.array([disc.diameter_mm if len(discs) == 4 else 0.0 for disc in discs])

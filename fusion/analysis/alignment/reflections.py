@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import linalg
 
 from fusion.common import Array
 from thermography.common import scatter_by_median
@@ -86,8 +86,8 @@ def _course(score: Array, jumps: NDArray[np.bool_], scatter: float) -> Array:
     for ratio in _LEVELS_OVER_WANDER:
         bands = np.full((2, changes.size), -ratio)
         bands[1] = 1.0 + 2.0 * ratio
-        factor = linalg.cholesky_banded(bands)
-        wander = linalg.cho_solve_banded((factor, False), changes)
+        factor = scipy.linalg.cholesky_banded(bands)
+        wander = scipy.linalg.cho_solve_banded((factor, False), changes)
         square = float(changes @ wander)
         variance = max(square / changes.size, scatter**2)
         found = -0.5 * (changes.size * np.log(variance) + square / variance) - float(np.log(factor[1]).sum())
@@ -116,7 +116,7 @@ def _leading_component(changes: Array) -> Array:
     by_cell = changes.shape[0] > changes.shape[1]
     products = changes.T @ changes if by_cell else changes @ changes.T
     last = products.shape[0] - 1
-    _, vectors = linalg.eigh(products, subset_by_index=(last, last), overwrite_a=True)
+    _, vectors = scipy.linalg.eigh(products, subset_by_index=(last, last), overwrite_a=True)
     component = vectors[:, 0] if by_cell else changes.T @ vectors[:, 0]
     return np.asarray(component / np.linalg.norm(component) * np.sign(component[np.argmax(np.abs(component))]))
 

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import special
 from threadpoolctl import threadpool_limits
 
 from fusion.analysis.alignment.first_order_lag import respond
@@ -120,7 +120,8 @@ def _check_law(place: str, seconds: Array, states: Array, law: DutyLaw) -> None:
     expected = seconds[-1] / law.mean_dwell_s
     if (
         changes.size
-        and min(special.pdtr(changes.size, expected), special.pdtrc(changes.size - 1, expected)) < _IMPOSSIBLE
+        and min(scipy.special.pdtr(changes.size, expected), scipy.special.pdtrc(changes.size - 1, expected))
+        < _IMPOSSIBLE
     ):
         raise RandomisationError(
             f"{place} was switched {changes.size} times in {seconds[-1] / 3600:.1f} h, where a mean dwell of {law.mean_dwell_s:g} s makes "
@@ -316,13 +317,13 @@ def _power(machine: Machine, hours: float, law: DutyLaw, rng: np.random.Generato
     columns = np.stack(
         [_drift_responses(machine, tau, law, fine, cycles, rng) for tau in machine.time_constants_s], axis=2
     )
-    threshold = special.chdtri(1, ATTRIBUTION_LEVEL / (_EFFECTIVE_RESPONSES * len(machine.sources)))
+    threshold = scipy.special.chdtri(1, ATTRIBUTION_LEVEL / (_EFFECTIVE_RESPONSES * len(machine.sources)))
     basis, _ = np.linalg.qr(trend)
     powers = []
     for k in range(_SCHEDULES):
         warmed = white @ columns[:, k]
         size = ((warmed - basis @ (basis.T @ warmed)) ** 2).sum(axis=0)
-        powers.append(special.ndtr(machine.effect_um * np.sqrt(size) / machine.noise_um - np.sqrt(threshold)))
+        powers.append(scipy.special.ndtr(machine.effect_um * np.sqrt(size) / machine.noise_um - np.sqrt(threshold)))
     return float(np.mean(powers, axis=0).min())
 
 

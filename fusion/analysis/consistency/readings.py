@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import sparse, special
 
 from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.consistency.checks import LASER, Found, check, judge
@@ -79,7 +79,7 @@ def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
     """Find readings that are errors of reading: they are left out where drift and field are compared and modelled."""
     size = abs(standardised)
     # The median absolute deviation about zero, in standard deviations of a normal distribution.
-    scatter = (size.median("cycle") / special.ndtri(0.75)).fillna(1.0).clip(min=1.0)
+    scatter = (size.median("cycle") / scipy.special.ndtri(0.75)).fillna(1.0).clip(min=1.0)
     return size > _GROSS_SIGMAS * scatter
 
 
@@ -117,7 +117,7 @@ def _unit_change(values: Array) -> tuple[int, float]:
     if len(values) < 2 * _UNIT_SIDE or values.shape[2] < _LEAST_TARGETS:
         return 0, 1.0
     window = np.lib.stride_tricks.sliding_window_view(values, _UNIT_SIDE, axis=0)
-    noise = np.median(np.abs(np.diff(window, 2, axis=-1)), axis=(1, 2, 3)) / (special.ndtri(0.75) * np.sqrt(6.0))
+    noise = np.median(np.abs(np.diff(window, 2, axis=-1)), axis=(1, 2, 3)) / (scipy.special.ndtri(0.75) * np.sqrt(6.0))
     shape = np.sqrt((_bent(window.mean(axis=-1), np.arange(window.shape[-2], dtype=float)) ** 2).mean(axis=(1, 2)))
     # A mean over the window shows a shape where that is large against its noise.
     clear = shape > _SHAPE_CLEAR * noise / np.sqrt(_UNIT_SIDE)
@@ -217,7 +217,7 @@ def repeated_value(linear: xr.Dataset) -> Found:
     chance = step_um / (np.sqrt(2.0 * np.pi) * random_um[scatters][at])
     expected = float((chance * np.isfinite(some[:, at]).sum(axis=0)).sum())
     # Any of the values might have been the most frequent one, and its first reading is no repetition.
-    p = found.size * float(special.gammainc(counts.max() - 1, expected)) if counts.max() > 1 else 1.0
+    p = found.size * float(scipy.special.gammainc(counts.max() - 1, expected)) if counts.max() > 1 else 1.0
     if p >= _COINCIDENCE:
         return _held_readings(linear) or sound
     end = {np.nanmax(some): "largest", np.nanmin(some): "smallest"}.get(value, "")
@@ -241,7 +241,7 @@ def _held_readings(deviations: xr.Dataset) -> Found | None:
         # The largest probability of one value of a difference of two readings, that at the centre of a normal distribution.
         expected += np.isfinite(np.diff(here, axis=1)).sum() * apart.min() / (2.0 * np.sqrt(np.pi) * random_um)
     count = int(equal.sum())
-    if count < 2 or float(special.gammainc(count, expected)) >= _COINCIDENCE:
+    if count < 2 or float(scipy.special.gammainc(count, expected)) >= _COINCIDENCE:
         return None
     return judge(count, expected, passed=False, um=None)
 
@@ -356,7 +356,7 @@ def _equal_shares(values: Array) -> Iterator[tuple[int, Array]]:
     present = np.isfinite(values)
     cycle, site = np.nonzero(present)
     _, number = np.unique(np.column_stack([site, values[present]]), axis=0, return_inverse=True)
-    holds = sparse.csr_array((np.ones(cycle.size), (cycle, number.ravel())), shape=(values.shape[0], cycle.size))
+    holds = scipy.sparse.csr_array((np.ones(cycle.size), (cycle, number.ravel())), shape=(values.shape[0], cycle.size))
     for start in range(0, values.shape[0], _CYCLES_AT_ONCE):
         rows = slice(start, start + _CYCLES_AT_ONCE)
         both = present[rows].astype(float) @ present.T.astype(float)
@@ -395,7 +395,7 @@ def approach_labels(linear: xr.Dataset) -> Found:
     total = np.nanmean(early, axis=0) + np.nanmean(late, axis=0)
     size = float(np.ptp([np.nanmean(early), np.nanmean(late)]))
     standardised = total / np.maximum(spread, 1e-12)
-    opposite = special.chdtrc(total.size, standardised @ standardised) >= _OPPOSITE_P
+    opposite = scipy.special.chdtrc(total.size, standardised @ standardised) >= _OPPOSITE_P
     # That drift fades over a test; no other change of the reversal error comes so near to its own opposite.
     opposite |= np.sqrt(np.mean(total**2)) <= _SAME_SIZE * 0.5 * size
     # An exchange happens from one cycle to the next, a reversal that drifts does not.

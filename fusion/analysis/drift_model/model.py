@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from fusion.analysis.alignment.readings import Readings
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
@@ -525,5 +525,6 @@ def _evidence(moments: Moments, prior: Array, flat: int) -> Array:
     _, log_determinant = np.linalg.slogdet(normal / np.outer(scale, scale) + _RIDGE * np.eye(scale.size))
     log_determinant += 2.0 * float(np.log(scale).sum())
     return np.asarray(
-        gammaln(0.5 * freedom) - 0.5 * (freedom * np.log(np.pi * left) + log_determinant + moments.log_spread)
+        scipy.special.gammaln(0.5 * freedom)
+        - 0.5 * (freedom * np.log(np.pi * left) + log_determinant + moments.log_spread)
     )
