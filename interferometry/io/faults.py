@@ -95,8 +95,8 @@ SENTINEL_MAGNITUDE = 1e19
 _SIGNS = str.maketrans({"\u2212": "-", "\u2013": "-", "\uff0d": "-", "\ufe63": "-", "\uff0b": "+"})
 _SPACES = re.compile(r"[\s\u00a0\u2007\u2009\u202f'\u2019]")
 _NUMBER = re.compile(r"[+-]?(\d+[\d.,]*|[.,]\d+)([eE][+-]?\d+)?")
-#: What most files write, and what has one meaning where the decimal separator is a point.
-_PLAIN = re.compile(r"[+-]?\d+(\.\d+)?")
+#: What most files write, and what has one meaning where the decimal separator is a point: finite, and below any mark for "no reading".
+_PLAIN = re.compile(r"[+-]?\d{1,18}(\.\d+)?")
 #: A separator followed by three digits, once or more, may part thousands.
 THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}([.,]\d{3})+")
 #: A number whose decimal separator is told by its digits: one separator, or another one after groups of three.
@@ -155,7 +155,7 @@ class Numerals:
     def number(self, text: str) -> float:
         """Return a finite number."""
         if self.decimal == "." and _PLAIN.fullmatch(text):
-            return parse_number(text)
+            return float(text)
         cleaned = _SPACES.sub("", text.strip().translate(_SIGNS))
         if not _NUMBER.fullmatch(cleaned):
             return parse_number(text)

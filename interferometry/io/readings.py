@@ -9,6 +9,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -540,7 +541,9 @@ def _read_labels(table: _Labelled, stated: Stated) -> Readings:
         lacking["deviation_unit"] = f"no heading states a unit of the deviations that is read{largest}"
     if position is not None and position.factor != 1.0:
         labels = [replace(label, position=label.position * position.factor) for label in labels]
-    if isinstance(directed := _with_directions(table, labels, order, stated.directions), str):
+    # Each text is read once, though the order of the readings asks for their times before they are taken.
+    at = cache(partial(parse_time, order=order))
+    if isinstance(directed := _with_directions(table, labels, at, stated.directions), str):
         lacking["directions"] = directed
     if lacking or position is None or value is None or isinstance(directed, str):
         raise NotStated(table.place, lacking)
@@ -553,7 +556,7 @@ def _read_labels(table: _Labelled, stated: Stated) -> Readings:
     for label in _renumber(table, directed):
         cell = label.number, label.direction, label.target
         with given.collect(label.line, cell):
-            time, zone = parse_time(label.time, order) if table.timed else (np.datetime64("NaT", "ns"), None)
+            time, zone = at(label.time) if table.timed else (np.datetime64("NaT", "ns"), None)
             reading = numerals.reading(label.value) * (label.unit or value).factor
             if of_positions:
                 reading -= label.position
@@ -593,14 +596,17 @@ def _compare_signs(given: Readings, differences: np.ndarray) -> None:
 
 
 def _with_directions(
-    table: _Labelled, labels: list[_Label], order: DateOrder, directions: Directions | None
+    table: _Labelled,
+    labels: list[_Label],
+    at: Callable[[str], tuple[np.datetime64, str]],
+    directions: Directions | None,
 ) -> list[_Label] | str:
     """Return labels with their directions: as the table names them, as the order of the positions in time tells, or as stated; why none of
     these is known.
     """
     if table.timed:
         with suppress(BadReading):
-            times = [parse_time(label.time, order)[0] for label in labels]
+            times = [at(label.time)[0] for label in labels]
             labels = [labels[at] for at in np.argsort(times, kind="stable")]
     runs = [(label.number, label.direction) for label in labels]
     named = all(label.direction for label in labels)

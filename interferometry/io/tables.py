@@ -154,9 +154,10 @@ def parse_time(text: str, order: DateOrder | None = None) -> tuple[np.datetime64
         stamp = _other_order(text, stripped, order or DateOrder())
     if not _YEARS[0] <= stamp.year <= _YEARS[1]:
         raise BadReading(text, f"is outside the years {_YEARS[0]} to {_YEARS[1]}")
-    zone = "" if stamp.tzinfo is None else stamp.strftime("%z")
-    utc = stamp if stamp.tzinfo is None else stamp.astimezone(UTC).replace(tzinfo=None)
-    return np.datetime64(utc, "ns"), zone
+    if stamp.tzinfo is None:
+        return np.datetime64(stamp, "ns"), ""
+    zone = "+0000" if stamp.tzinfo is UTC else stamp.strftime("%z")
+    return np.datetime64(stamp.astimezone(UTC).replace(tzinfo=None), "ns"), zone
 
 
 def _other_order(text: str, stripped: str, order: DateOrder) -> datetime:
