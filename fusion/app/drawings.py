@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import panel as pn
-from bokeh.models import CustomJS, Range1d
+from bokeh.models import Range1d
 from bokeh.plotting import figure
 
+from fusion.app.parts import schedule_update
 from fusion.report.charts.style import new_figure
 from interferometry.plots import INK
 
@@ -19,12 +20,15 @@ def keep_scale(drawn: figure, x: Ends, y: Ends) -> figure:
     """Show these ranges to scale: the height follows the width that the page leaves to the drawing."""
     drawn.update(x_range=Range1d(*x), y_range=Range1d(*y), match_aspect=False)
     ratio = abs((y[1] - y[0]) / (x[1] - x[0]))
-    # A drawing that is hidden has no size.
-    follow = """
-        const around = cb_obj.outer_height - cb_obj.inner_height;
-        if (cb_obj.inner_width > 0 && around > 0) cb_obj.height = Math.round(cb_obj.inner_width * ratio + around);
-    """
-    drawn.js_on_change("inner_width", CustomJS(args={"ratio": ratio}, code=follow))
+
+    def follow() -> None:
+        around = drawn.outer_height - drawn.inner_height
+        # A drawing that is hidden has no size.
+        if drawn.inner_width > 0 and around > 0:
+            drawn.height = round(drawn.inner_width * ratio + around)
+
+    # The page tells the sizes one after the other.
+    drawn.on_change("inner_width", lambda attr, old, new: schedule_update(follow))
     return drawn
 
 

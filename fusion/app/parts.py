@@ -29,6 +29,11 @@ def column(*parts: Any, **options: Any) -> pn.Column:
     return pn.Column(*parts, sizing_mode="stretch_width", **options)
 
 
+def beside(*parts: Any, **styles: str) -> pn.Row:
+    """Return parts side by side, on further lines where one does not hold them; FlexBox of panel would have the page compile functions."""
+    return pn.Row(*parts, sizing_mode="stretch_width", styles={"flex-wrap": "wrap", **styles})
+
+
 def text_field(label: str, value: object = "") -> pn.widgets.TextInput:
     """Return a field for a path, as wide as the page."""
     return pn.widgets.TextInput(label=label, value=str(value), sizing_mode="stretch_width")
@@ -209,8 +214,8 @@ class ReportHandler(RequestHandler):
         self.set_header("Cache-Control", "no-store")
         self.set_header(
             "Content-Security-Policy",
-            "sandbox allow-scripts allow-downloads allow-modals allow-popups; default-src 'none'; script-src 'unsafe-inline' "
-            "'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'",
+            "sandbox allow-scripts allow-downloads allow-modals allow-popups; default-src 'none'; script-src 'unsafe-inline'; "
+            "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'",
         )
         self.finish(path.read_bytes())
 

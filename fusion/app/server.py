@@ -38,9 +38,9 @@ from fusion.app.runs import RUNS
 
 # Authentication: every request is checked here before any page, file or connection answers it.
 
-#: Bokeh compiles the small functions of its pages, hence 'unsafe-eval'; nothing comes from another host.
+#: A page runs the scripts of this server alone and compiles none, so no part of a page may be one that does (FlexBox, CustomJS).
 _CONTENT = (
-    "default-src 'self'; script-src 'self' 'nonce-{nonce}' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "default-src 'self'; script-src 'self' 'nonce-{nonce}'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "font-src 'self' data:; connect-src 'self' ws://{host}; frame-src 'self'; object-src 'none'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'self'"
 )

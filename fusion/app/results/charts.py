@@ -89,8 +89,8 @@ class ThermalView:
             "area that the drift follows, where there is one; one colour scale for all cycles."
         )
         chart = shown_drawing(self._map)
-        controls = pn.FlexBox(self._x, self._y, self._size, self._add)
-        quantity = pn.FlexBox(self._quantity, self._cycle)
+        controls = ui.beside(self._x, self._y, self._size, self._add)
+        quantity = ui.beside(self._quantity, self._cycle)
         return ui.column(
             quantity, self._player, self._told, chart, ui.note(legend), controls, self._places, self._history
         )

@@ -94,7 +94,7 @@ def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
     if write is not None:
         sheets = {"PDF": "sheet.pdf", "Word": "sheet.docx"}
         made = [button(f"Test sheet to sign ({kind})", name, partial(write, folder)) for kind, name in sheets.items()]
-    return ui.column(pn.FlexBox(*made, report), told)
+    return ui.column(ui.beside(*made, report), told)
 
 
 def _put(out: Path, write: Callable[[Path], object]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import panel as pn
 
-from fusion.app.parts import column, heading, note, table
+from fusion.app.parts import beside, column, heading, note, table
 from fusion.campaign.columns import ROLES, TableProposal
 from fusion.results.progress import counted
 
@@ -47,7 +47,7 @@ class ColumnsView:
                 )
         told = note("Columns that are out are not read. A unit may be that of one count, such as 0.0125 mm.")
         pairs = [pn.Row(*pair) for pair in self._widgets.values()]
-        self.view[:] = [heading("Columns of the record", level=3), shown, told, pn.FlexBox(*pairs)]
+        self.view[:] = [heading("Columns of the record", level=3), shown, told, beside(*pairs)]
 
     @property
     def stated(self) -> dict[str, dict[str, Any]]:

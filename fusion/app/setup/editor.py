@@ -131,7 +131,7 @@ class CampaignEditor:
         self._remarks, self._checked = ui.column(), ui.column()
         pictures = (self._times.view, self._frame.view, self._plan.view, self._regions.view)
         answer = ui.column(self._checked, styles={"max-height": "38vh", "overflow-y": "auto"})
-        self.saving = ui.column(pn.FlexBox(self._save, self._go), answer)
+        self.saving = ui.column(ui.beside(self._save, self._go), answer)
         shown = (self._form.required, *pictures, self._columns.view, self._form.view)
         self.view = ui.column(self._remarks, *shown)
         self._save.on_click(self._on_save)

@@ -10,7 +10,7 @@ from typing import Any
 
 import panel as pn
 
-from fusion.app.parts import Parts, column, heading
+from fusion.app.parts import Parts, beside, column, heading
 from fusion.app.setup.campaign import CampaignText
 from fusion.campaign.draft import DIRECTIONS, TO_FILL
 from fusion.campaign.schema import Key, known_keys
@@ -286,10 +286,10 @@ class Form:
 
     def _side_by_side(
         self, fields: Sequence[Key], texts: Mapping[str, str], *others: pn.widgets.Widget, width: int = 250
-    ) -> pn.FlexBox:
+    ) -> pn.Row:
         """Return fields whose boxes are in line, however many lines their labels take."""
         widgets = [self._widget(field, texts.get(field.name, ""), width=width) for field in fields]
-        return pn.FlexBox(*widgets, *others, align_items="flex-end")
+        return beside(*widgets, *others, **{"align-items": "flex-end"})
 
     def _widget(self, field: Key, text: str, *, width: int) -> pn.widgets.Widget:
         if field.options:

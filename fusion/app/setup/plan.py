@@ -20,7 +20,7 @@ from bokeh.plotting import figure
 from numpy.typing import NDArray
 
 from fusion.app.drawings import add_cross, scaled_drawing, shown_drawing
-from fusion.app.parts import column, heading, markup, note, paragraph_markup, table
+from fusion.app.parts import beside, column, heading, markup, note, paragraph_markup, table
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.common import FusionError
 from fusion.report.charts.plan import add_names
@@ -258,9 +258,7 @@ class FrameView:
         for key, entry in self._numbers.items():
             entry.param.watch(lambda event, key=key: self._type(key, event.new), "value")
         title = heading("Fiducials in the first thermogram", level=3)
-        controls = column(
-            pn.FlexBox(search, self._adds, add), pn.FlexBox(self._chosen, *self._numbers.values(), remove)
-        )
+        controls = column(beside(search, self._adds, add), beside(self._chosen, *self._numbers.values(), remove))
         self.view = column(title, self._message, self._picture, controls, self._table)
 
     def show(self, frame: NDArray[np.float64], placed: Placed, grid: PlanGrid | None) -> None:
@@ -581,9 +579,9 @@ class RegionsView:
         remove.on_click(self._remove)
         self._shape.param.watch(lambda event: self._take([]), "value")
         self._points.param.watch(lambda event: self._changed(), "value")
-        fields = pn.FlexBox(self._shape, self._points, self._name, self._emissivity, add)
+        fields = beside(self._shape, self._points, self._name, self._emissivity, add)
         title = heading("Regions", level=3)
-        self.view = column(title, fields, pn.FlexBox(self._chosen, remove), self._told)
+        self.view = column(title, fields, beside(self._chosen, remove), self._told)
 
     @property
     def outlines(self) -> list[tuple[str, Array]]:

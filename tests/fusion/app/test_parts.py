@@ -92,6 +92,7 @@ def test_the_report_is_sent_whole_and_in_a_sandbox(app, cookie, ask):
     assert answer.status == 200 and answer.body == (folder / "results" / "report.html").read_bytes()
     policy = answer.headers["Content-Security-Policy"]
     assert policy.startswith("sandbox ") and "allow-same-origin" not in policy and "default-src 'none'" in policy
+    assert "unsafe-eval" not in policy
 
 
 #: Other files of the folder, a link out of it, and ways out of it.

@@ -63,7 +63,7 @@ def test_every_answer_says_what_a_browser_may_do_with_it(app, cookie, ask):
     for answer in (ask(app[0], "/"), ask(app[0], "/", Cookie=cookie), ask(app[0], "/none", Cookie=cookie)):
         policy = answer.headers["Content-Security-Policy"]
         assert "default-src 'self'" in policy and "script-src 'self' 'nonce-" in policy
-        assert "script-src 'self' 'unsafe-inline'" not in policy
+        assert "script-src 'self' 'unsafe-inline'" not in policy and "unsafe-eval" not in policy
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
         assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
 
