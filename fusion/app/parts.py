@@ -31,7 +31,7 @@ def column(*parts: Any, **options: Any) -> pn.Column:
 
 def beside(*parts: Any, **styles: str) -> pn.Row:
     """Return parts side by side, on further lines where one does not hold them; FlexBox of panel would have the page compile functions."""
-    return pn.Row(*parts, sizing_mode="stretch_width", styles={"flex-wrap": "wrap", **styles})
+    return pn.Row(*parts, styles={"flex-wrap": "wrap", **styles})
 
 
 def text_field(label: str, value: object = "") -> pn.widgets.TextInput:
