@@ -260,6 +260,8 @@ def build_page(root: Path) -> Any:
 
 #: Largest message of a page: a chunk of an uploaded file with its frame.
 _LARGEST_MESSAGE = 12 * 1024 * 1024
+#: How long a page that was sent waits for its browser to answer: one that comes later is built anew, and asks other hosts for its styles.
+_WAITS_FOR_BROWSER_MS = 600_000
 _ADDRESS = "127.0.0.1"
 
 
@@ -317,6 +319,7 @@ def build_server(root: Path, *, port: int = 0) -> tuple[Any, str]:
         build_applications({"/": lambda: build_page(root)}, title="thermofuse"),
         credentials=credentials,
         websocket_max_message_size_bytes=_LARGEST_MESSAGE,
+        unused_session_lifetime_milliseconds=_WAITS_FOR_BROWSER_MS,
         extra_patterns=[(r"/report/(.*)", ReportHandler, {"root": root})],
         include_headers=[],
         include_cookies=[],
