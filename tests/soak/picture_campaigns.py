@@ -244,15 +244,53 @@ def _to_counts(image: Array) -> Array:
     return image - CAMERA.planck_o
 
 
-@lru_cache(maxsize=8)
-def _rays(size: tuple[int, int], pose: bytes, focal_px: float) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Plan points of a camera, mm, and which of them lie on the table."""
-    values = np.frombuffer(pose)
-    camera = View(values[:9].reshape(3, 3), values[9:12], focal_px, values[12:], size)
+@lru_cache(maxsize=3)
+def _rays(size: tuple[int, int], focal_px: float, lens: bytes) -> Array:
+    """Directions of the points of every pixel of a camera, (point, row, column) as one axis."""
+    camera = View(np.eye(3), np.zeros(3), focal_px, np.frombuffer(lens), size)
     offsets = (np.arange(_FINE) + 0.5) / _FINE - 0.5
-    column, row = np.meshgrid(*((np.arange(n)[:, None] + offsets).ravel() for n in reversed(size)))
-    x, y = camera.to_plan(np.stack([column, row], axis=-1).reshape(-1, 2)).T
-    return x, y, np.flatnonzero((x >= 0) & (x <= GRID.width_mm) & (y >= 0) & (y <= GRID.height_mm))
+    down, across, row, column = np.meshgrid(offsets, offsets, *map(np.arange, size), indexing="ij")
+    return np.asarray(camera.rays(np.stack([column + across, row + down], axis=-1).reshape(-1, 2)))
+
+
+@lru_cache(maxsize=2)
+def _scene(
+    size: tuple[int, int],
+    focal_px: float,
+    lens: bytes,
+    pose: bytes,
+    places: tuple[tuple[float, float], ...],
+    disc_mm: float,
+) -> tuple[NDArray[np.intp], Array, Array, NDArray[np.bool_], Array]:
+    """Pixels that show the table, and of their points (point, pixel) the plan's x and y, mm, whether they lie on it, and emissivity."""
+    values = np.frombuffer(pose)
+    camera = View(values[:9].reshape(3, 3), values[9:], focal_px, np.frombuffer(lens), size)
+    x, y = camera.meets_plan(_rays(size, focal_px, lens)).T.reshape(2, _FINE**2, -1)
+    on_table = (x >= 0) & (x <= GRID.width_mm) & (y >= 0) & (y <= GRID.height_mm)
+    pixels = np.flatnonzero(on_table.any(axis=0))
+    x, y, on_table = x[:, pixels], y[:, pixels], on_table[:, pixels]
+    emissivity = np.full(x.shape, EMISSIVITY)
+    for place in places:
+        near = np.flatnonzero(np.abs(x[0] - place[0]) + np.abs(y[0] - place[1]) < 2 * disc_mm)
+        on_disc = np.hypot(x[:, near] - place[0], y[:, near] - place[1]) < disc_mm / 2
+        emissivity[:, near] = np.where(on_disc, DISC_EMISSIVITY, emissivity[:, near])
+    return pixels, x, y, on_table, emissivity
+
+
+@lru_cache(maxsize=64)
+def _radiance(
+    view_of: tuple[Any, ...], celsius: Callable[[Array, Array, float], Array], now: Now, faults: tuple[Fault, ...]
+) -> Array:
+    """Counts of one frame before the lens's blur. Campaigns that differ in what lens and sensor do share it."""
+    pixels, x, y, on_table, emissivity = _scene(*view_of)
+    own = celsius(x, y, now.seconds)
+    for fault in faults:
+        own, emissivity = fault.surface(x, y, own, emissivity, now)
+    reflected = float(signal(REFLECTED_C))
+    room = 0.95 * float(signal(ROOM_C)) + 0.05 * reflected
+    image = np.full(view_of[0], room)
+    image.flat[pixels] = np.where(on_table, reflected + emissivity * (signal(own) - reflected), room).mean(axis=0)
+    return image
 
 
 @dataclass(frozen=True)
@@ -298,21 +336,10 @@ class Campaign:
         """One frame, (row, column)."""
         rng = np.random.default_rng((self.seed, 2, now.frame))
         camera = reduce(lambda one, fault: fault.seen_from(one, now), self.faults, self.camera)
-        pose = np.concatenate([camera.turn.ravel(), camera.shift_mm, camera.lens])
-        x, y, on_table = _rays(camera.shape, pose.tobytes(), camera.focal_px)
-        plan_x, plan_y = x[on_table], y[on_table]
-        own = self.celsius(plan_x, plan_y, now.seconds)
-        emissivity_of = np.full(on_table.size, EMISSIVITY)
-        for place in self.places:
-            across = np.flatnonzero(np.abs(plan_x - place[0]) < self.disc_mm / 2)
-            on_disc = np.hypot(plan_x[across] - place[0], plan_y[across] - place[1]) < self.disc_mm / 2
-            emissivity_of[across[on_disc]] = DISC_EMISSIVITY
-        for fault in self.faults:
-            own, emissivity_of = fault.surface(plan_x, plan_y, own, emissivity_of, now)
-        rays = np.full(x.shape, 0.95 * float(signal(ROOM_C)) + 0.05 * float(signal(REFLECTED_C)))
-        rays[on_table] = emissivity_of * signal(own) + (1 - emissivity_of) * signal(REFLECTED_C)
-        rows, columns = camera.shape
-        image = np.asarray(rays.reshape(rows, _FINE, columns, _FINE).mean(axis=(1, 3)))
+        pose = np.concatenate([camera.turn.ravel(), camera.shift_mm])
+        view_of = (camera.shape, camera.focal_px, camera.lens.tobytes(), pose.tobytes(), self.places, self.disc_mm)
+        on_it = tuple(fault for fault in self.faults if type(fault).surface is not Fault.surface)
+        image = _radiance(view_of, self.celsius, now, on_it)
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), self.blur_px))
         for fault in self.faults:
             image = fault.before(camera, image, now)

@@ -62,12 +62,19 @@ class View:
 
     def to_plan(self, points_px: np.ndarray) -> np.ndarray:
         """Locate pixels (n, 2) on the plan, (n, 2) mm."""
+        return self.meets_plan(self.rays(points_px))
+
+    def rays(self, points_px: np.ndarray) -> np.ndarray:
+        """Directions of pixels (n, 2) in the camera's system, (n, 2) per unit of depth."""
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-9)
         pixels = np.ascontiguousarray(points_px, float).reshape(-1, 1, 2)
-        rays = cv2.undistortPoints(pixels, self.matrix, self.lens, None, None, np.eye(3), criteria)[:, 0]
+        return cv2.undistortPoints(pixels, self.matrix, self.lens, None, None, np.eye(3), criteria)[:, 0]
+
+    def meets_plan(self, rays: np.ndarray) -> np.ndarray:
+        """Where directions (n, 2) meet the plan, (n, 2) mm."""
         plane = np.column_stack([self.turn[:, 0], self.turn[:, 1], self.shift_mm])
-        points = np.column_stack([rays, np.ones(len(rays))]) @ np.linalg.inv(plane).T
-        return points[:, :2] / points[:, 2:]
+        x, y, depth = np.linalg.inv(plane) @ np.vstack([rays.T, np.ones(len(rays))])
+        return np.stack([x / depth, y / depth], axis=1)
 
     def in_view(self, points_mm: np.ndarray) -> np.ndarray:
         """Plan points (n, 2) that the frame shows, (m, 2)."""
