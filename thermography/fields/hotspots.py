@@ -27,6 +27,8 @@ _EQUAL_RISE = 3.0
 _RADII = (2, 3, 5, 8, 12)
 #: A fit holds where its mean square exceeds that of the noise by at most this many of its standard deviations.
 _LARGEST_MISFIT = 2.0
+#: Multiple of that up to which the smallest disc is believed, with the uncertainty that its misfit asks for: nothing smaller tells.
+_ALONE = 1.25
 #: Mean square of the distance of the points of a cell from its centre along one axis, cells2: what averaging over it widens a peak by.
 _OF_CELL = 1.0 / 12.0
 
@@ -294,7 +296,7 @@ def _vertex(values: Array, peak: _Peak) -> tuple[float, float, float, Array]:
                 continue
             top, u, misfit = fitted
             at = np.clip(top[:2], least, most)
-            if misfit > 1.0:
+            if misfit > (_ALONE if smaller is None else 1.0):
                 if smaller is not None:
                     # What the next larger disc says beyond its noise, carried on to a disc of no size: the top depends on the shape.
                     change = (top - tops[-1]) ** 2 - np.maximum(us[-1] ** 2 - u**2, 0.0)
@@ -316,9 +318,11 @@ def _vertex(values: Array, peak: _Peak) -> tuple[float, float, float, Array]:
     top, each_u = np.array(tops), np.array(us)
     best = int(np.argmin(each_u.prod(axis=1)))
     weight = 1.0 / each_u**2
-    # Scatter beyond that of the noise: the smaller disc is a part of the larger one.
-    excess = (top - top[best]) ** 2 - np.maximum(each_u**2 - each_u[best] ** 2, 0.0)
-    scatter = np.maximum((weight * excess).sum(axis=0) / weight.sum(axis=0), 0.0)
+    # Scatter beyond that of the noise, where it exceeds the standard deviation that noise gives it: the smaller disc is a part of the
+    # larger one, and differences from the best fit go together.
+    by_noise = np.maximum(each_u**2 - each_u[best] ** 2, 0.0)
+    excess = (weight * ((top - top[best]) ** 2 - by_noise)).sum(axis=0) / weight.sum(axis=0)
+    scatter = np.where(excess > np.sqrt(2.0) * (weight * by_noise).sum(axis=0) / weight.sum(axis=0), excess, 0.0)
     beside = misfits[models[best]]
     for at in beyond:  # the place is known to the edge
         beside[:2] = np.maximum(beside[:2], (at - top[best, :2]) ** 2)
