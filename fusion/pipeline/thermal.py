@@ -18,8 +18,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
-from fusion.analysis.consistency.field_series import field_at, thin_fields
-from fusion.analysis.consistency.material import rise_share_u
+from fusion.analysis.consistency.field_series import FieldSeries, field_at, thin_fields
+from fusion.analysis.consistency.material import rise_share_u, share_of_zero
 from fusion.campaign.config import RegionTable, ThermographyTable
 from fusion.campaign.inputs import (
     OVERRIDABLE,
@@ -111,6 +111,8 @@ class CameraState:
         they are not in view.
     reflected_u_K : (frames,) ndarray or None, K
         Standard uncertainty of the change of the reflected temperature since the first frame; None where neither log nor discs show it.
+    zero : (time,) DataArray or None, K
+        What a material sensor shows of the change of the zero that is left, at times on the laser's clock.
     part, notices
         Part ``camera`` of results.json, and what was left out, corrected, or cannot be distinguished.
     """
@@ -122,6 +124,7 @@ class CameraState:
     reflected_u_K: Array | None
     part: CameraPart
     notices: list[Notice]
+    zero: xr.DataArray | None = None
 
     def per_cycle(self, bounds: Array) -> xr.Dataset:
         """Mean correction and uncertainty of every cycle, its bounds (cycles, 2) on the camera's clock."""
@@ -267,22 +270,33 @@ def _held_against_discs(
     camera = replace(camera, reflected_u_K=np.interp(every, shown.index, np.abs(left)) / np.sqrt(3.0))
     if source.thermography.reference_patch_px is not None:
         return camera, found
-    room = _room(source)[shown.index]
+    room, of_split = _room(source)[shown.index], np.zeros(len(left))
     if room.shape[1]:
         # Discs reflect the room, whose surfaces change by no more than its air; a steady drift beside it is the zero's.
         room = room - room[0]
         design = np.column_stack([shown.index / shown.index[-1], room])
         most = np.array([np.inf, *np.ones(room.shape[1])])
         found_in = scipy.optimize.lsq_linear(design, left, (np.where(most > 1.0, -np.inf, 0.0), most)).x
+        scatter = float(np.std(left - design @ found_in))
+        of_split = design[:, 0] * scatter * np.sqrt(np.linalg.pinv(design.T @ design)[0, 0])
         left = left - room @ found_in[1:]
         left -= left[0]
-    # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7), but no more than
-    # the surroundings show, which share the zero.
-    zero_u_K = np.minimum(np.interp(every, shown.index, np.abs(left)), camera.surroundings_K) / np.sqrt(3.0)
+    # The zero or what the discs reflect, but no more than the surroundings show, which share the zero.
+    most_K = np.minimum(np.interp(every, shown.index, np.hypot(left, of_split)), camera.surroundings_K)
+    most_K = np.maximum(most_K, np.sqrt(3.0) * camera.u_K) * np.sign(np.interp(every, shown.index, left))
+    # From nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7), or the share that the material sensor shows.
+    share, share_rms = 0.0, 1.0 / np.sqrt(3.0)
+    offset_s = source.thermography.clock_offset_s or 0.0
+    on_laser = fields.assign_coords(time=camera_on_laser_clock(fields["time"].values, offset_s))
+    zero = xr.DataArray(most_K, {"time": camera_on_laser_clock(source.frame_times, offset_s)})
+    if (near := _at_sensor(source, on_laser)) is not None:
+        emissivity_u = stated_uncertainty(source.thermography).emissivity / source.frames[0].parameters.emissivity
+        share, share_rms = share_of_zero(near, source.environment, near.interpolated(zero), emissivity_u)
+    zero_u_K = np.maximum(camera.u_K, share_rms * np.abs(most_K))
     pattern_u_K = np.sqrt(np.mean((shown.pattern_K - shown.pattern_K[0]) ** 2, axis=1))
-    u_K = np.hypot(np.maximum(camera.u_K, zero_u_K), np.interp(every, shown.index, pattern_u_K))
+    u_K = np.hypot(zero_u_K, np.interp(every, shown.index, pattern_u_K))
     part = camera.part.model_copy(update={"largest_u_K": float(u_K.max())})
-    return replace(camera, u_K=u_K, part=part), {**found, "zero_K": float(np.ptp(left))}
+    return replace(camera, u_K=u_K, part=part, zero=share * zero), {**found, "zero_K": float(np.ptp(left))}
 
 
 def camera_corrected(part: CameraPart) -> bool:
@@ -388,30 +402,47 @@ def stated_uncertainty(table: ThermographyTable) -> InputUncertainty:
     return InputUncertainty(**{name: u for name, u in given.items() if u is not None})
 
 
-def _by_material_sensor(source: CameraInputs, fields: xr.Dataset, emissivity: float, assumed_u: float) -> float | None:
+def _at_sensor(source: CameraInputs, on_laser: xr.Dataset) -> FieldSeries | None:
+    """The camera at the material sensor, where its place is stated."""
+    place_mm = source.interferometry.material_sensor_mm if isinstance(source, Source) else None
+    return None if place_mm is None else field_at(on_laser, place_mm)
+
+
+def _by_material_sensor(
+    source: CameraInputs, on_laser: xr.Dataset, emissivity: float, assumed_u: float, zero: xr.DataArray | None
+) -> float | None:
     """Standard uncertainty of an emissivity that the material sensor leaves; None where it is stated, or the sensor tells nothing."""
     if not isinstance(source, Source) or source.thermography.emissivity_u is not None:
         return None
-    place_mm = source.interferometry.material_sensor_mm
-    near = thin_fields(fields) if place_mm is None else field_at(fields, place_mm)
-    share = rise_share_u(near, source.environment, stated=place_mm is not None)
+    stated = source.interferometry.material_sensor_mm is not None
+    near = _at_sensor(source, on_laser) if stated else thin_fields(on_laser)
+    if stated and near is not None and zero is not None:
+        near = replace(near, temperature=near.temperature - near.interpolated(zero)[:, None])
+    share = rise_share_u(near, source.environment, stated=stated)
     if share is None:
         return None
     # Beyond a third of it an emissivity has no upper end.
     u = emissivity * min(share, 1.0 / 3.0)
-    return u if place_mm is not None else max(u, assumed_u)
+    return u if stated else max(u, assumed_u)
 
 
 def complete_fields(
-    source: CameraInputs, fields: xr.Dataset, parameters: Overrides, *, offset_s: float = 0.0
+    source: CameraInputs,
+    fields: xr.Dataset,
+    parameters: Overrides,
+    *,
+    offset_s: float = 0.0,
+    zero: xr.DataArray | None = None,
 ) -> Outcome[xr.Dataset]:
-    """Calibrate the surfaces that have an emissivity of their own, and add the total uncertainties."""
+    """Calibrate the surfaces that have an emissivity of their own, and add the total uncertainties; what the material sensor shows of the
+    emissivity is free of the zero of the camera in the frames of `fields`, K.
+    """
     table, inputs = source.thermography, stated_uncertainty(source.thermography)
     along = {"cycle": "cycle_time", "time": "time"}
     cameras = {name: _parameters_at(source, parameters, fields[time].values) for name, time in along.items()}
     camera = cameras["cycle"][reference_cycle(fields["temperature"])]
     on_laser = fields.assign_coords(time=camera_on_laser_clock(fields["time"].values, offset_s))
-    if (measured_u := _by_material_sensor(source, on_laser, camera.emissivity, inputs.emissivity)) is not None:
+    if (measured_u := _by_material_sensor(source, on_laser, camera.emissivity, inputs.emissivity, zero)) is not None:
         inputs = replace(inputs, emissivity=measured_u)
     if table.reflected_change_u_K is not None:
         fields = fields.drop_vars("reflected_change_u", errors="ignore")
@@ -659,7 +690,7 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     repeated = [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]
     fields = fields.assign_attrs(frames_damaged=json.dumps(damaged), frames_repeated=json.dumps(repeated))
     fields = fields.assign_coords(cycle=source.cycles.number)
-    completed = complete_fields(source, fields, override, offset_s=offset_s)
+    completed = complete_fields(source, fields, override, offset_s=offset_s, zero=camera.zero)
     fields = check(completed.dataset, FIELDS, name="the fields")
     if still:
         unnamed = describe_unnamed_surfaces(fields, override(first[0]))

@@ -38,6 +38,10 @@ class FieldSeries:
         """Return times, (m,) datetime64, as seconds since `start`."""
         return np.asarray((times.astype("datetime64[ns]") - self.start) / np.timedelta64(1, "s"), float)
 
+    def interpolated(self, series: xr.DataArray) -> Array:
+        """Return a series along time at the frames, (n,)."""
+        return np.interp(self.seconds, self.since_start(series["time"].values), series.values)
+
     def lagged(self, time_constant_s: float) -> Array:
         """Return what a sensor of a time constant, s, would show on every cell, (n, cells), degC."""
         return respond(self.temperature, self.seconds, time_constant_s=time_constant_s)

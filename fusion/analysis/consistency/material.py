@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.consistency.checks import CAMERA, LOG, Found, check, judge
 from fusion.analysis.consistency.field_series import (
     LEAST_CHANGE_K,
@@ -77,6 +78,31 @@ def rise_share_u(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bo
     # stated is no measurement of the scale: that it could lie elsewhere says nothing of the camera.
     off = max(abs(slope - 1.0) for slope in slopes) if stated else abs(_off(slopes))
     return float(np.hypot(_CONTACT, off / np.sqrt(3.0))) if stated or off > 0.0 else None
+
+
+def share_of_zero(near: FieldSeries, log: xr.Dataset | None, zero_K: Array, gain_u: float) -> tuple[float, float]:
+    """Mean and root mean square of the share of a change at the frames, (n,) K, that is one of the camera's zero: from nothing to all of it
+    (rectangular), by what the material sensor at this place shows of it beside a gain that is known to `gain_u`.
+    """
+    shares, logged = np.linspace(0.0, 1.0, 101), log_with_camera(near, log)
+    weight, best = np.ones(shares.size), np.inf
+    if logged is not None and logged.inside.sum() >= LEAST_FRAMES:
+        inside, material = logged.inside, logged.material
+        for lag_s in SENSOR_LAGS_S:
+            zero = respond(zero_K[:, None], near.seconds, time_constant_s=lag_s)[inside, 0]
+            columns = np.column_stack([zero - zero.mean(), material - material.mean()])
+            off = near.lagged(lag_s)[inside, 0] - material
+            # What a probe leaves of a course is no noise: a test tells as many values as it has parts.
+            known = columns.T * _PARTS / len(off) / _PROBE_K**2
+            covariance = np.linalg.pinv(known @ columns + np.diag([0.0, 1.0 / (gain_u**2 + _CONTACT**2)]))
+            values = covariance @ known @ (off - off.mean())
+            left = float(np.var(off - columns @ values))
+            if left < best:
+                best, variance = left, max(float(covariance[0, 0]), 1e-12) * max(left / _PROBE_K**2, 1.0)
+                apart = (shares - values[0]) ** 2 / (2.0 * variance)
+                weight = np.exp(apart.min() - apart)
+    weight = weight / weight.sum()
+    return float(weight @ shares), float(np.sqrt(weight @ shares**2))
 
 
 @check("fields", CAMERA, waits=True)
