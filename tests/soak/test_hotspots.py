@@ -67,7 +67,7 @@ COUNTS = {"on a slope": (1, 2), "two, 50 mm apart": (2,)}
 #: Smallest and largest root mean square of error over uncertainty, 0.7 and 1.4 widened by twice their own standard deviation and, below,
 #: by what other shapes add to u; a shape that is no Gaussian only has an upper limit.
 KINDS = {
-    **{f"gaussian {width}": (0.45, 1.6) for width in (6, 10, 30, 60)},
+    **{f"gaussian {width}": (0.55, 1.6) for width in (6, 10, 30, 60)},
     "elliptic": (0.45, 1.6),
     "on a slope": (0.3, 1.6),
     **dict.fromkeys(("two, 50 mm apart", "flat disc", "at the edge"), (0.0, 1.6)),

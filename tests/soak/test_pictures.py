@@ -150,8 +150,8 @@ def judge(folder: Path, camera: str, fault: Fault, placed: Callable[[Any], bool]
         frozenset(said),
         placed(fields),
         int((ratio[shown] > 4).sum()),
-        float(error[shown].max()),
-        float(np.sqrt(np.mean(ratio[shown] ** 2))),
+        float(error[shown].max(initial=0.0)),
+        float(np.sqrt(np.mean(ratio[shown] ** 2))) if shown.any() else 0.0,
     )
 
 

@@ -251,6 +251,8 @@ def describe_unnamed_surfaces(fields: xr.Dataset, parameters: CameraParameters) 
 _OFF_K = 0.5
 #: ... and by more than this many standard deviations of its noise.
 _OFF_SIGMAS = 8.0
+#: ... and by more than this many standard deviations of what most pixels change by: columns may have a noise of their own.
+_OFF_SPREADS = 4.0
 #: A frame is obstructed if more than this share of the sampled pixels is off, beyond single bad pixels.
 _OFF_SHARE = 0.02
 #: An obstruction passes within this time, s, or this number of frames; what stays longer is a change of the scene.
@@ -263,10 +265,11 @@ _LEAST_PIXELS = 30
 
 def pixels_off(values: Array, lowest: Array, highest: Array, noise_K: float) -> Array:
     """Share of the pixels of every frame that lie outside a range, apart from a change that all pixels share."""
-    middle = (lowest + highest) / 2
-    level = np.nanmedian(values - middle, axis=1, keepdims=True)
-    beyond = np.maximum(values - level - highest, lowest - values + level)
-    off = beyond > np.nanmax([_OFF_K, _OFF_SIGMAS * noise_K])
+    change = values - (lowest + highest) / 2
+    change -= np.nanmedian(change, axis=1, keepdims=True)
+    spread = MAD_TO_SIGMA * np.nanmedian(np.abs(change), axis=1, keepdims=True)
+    limit = np.fmax(np.nanmax([_OFF_K, _OFF_SIGMAS * noise_K]), _OFF_SPREADS * spread)
+    off = np.abs(change) - (highest - lowest) / 2 > limit
     return off.mean(axis=1)
 
 

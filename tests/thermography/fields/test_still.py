@@ -412,6 +412,14 @@ def test_a_common_change_is_no_object_and_limits_grow_with_the_noise():
     np.testing.assert_allclose(pixels_off(values, base, base, 0.2), [0.0, 0.0])
 
 
+def test_noise_that_columns_share_obstructs_nothing(rng):
+    base = np.linspace(20.0, 24.0, 2000)
+    values = base + np.repeat(rng.normal(0, 0.3, (5, 200)), 10, axis=1)
+    assert (np.abs(values - base) > 0.5).mean() > 0.05
+    # Four robust standard deviations of 200 columns: none, or one.
+    assert pixels_off(values, base, base, 0.05).max() <= 0.005
+
+
 WHOLE = [RegistrationSpan(0, None)]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -206,6 +208,20 @@ def test_a_sound_camera_passes(stated: bool) -> None:
     found = checks(stated=stated)
     assert found["material_rise"].passed and found["material_level"].passed
     assert found["material_rise"].value == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("planted", [0.0, 0.5, 1.0])
+def test_a_sensor_shows_how_much_of_a_change_is_the_zero_of_the_camera(planted: float) -> None:
+    test = recorded()
+    near = field_at(test.fields, SENSOR_MM)
+    assert near is not None
+    change_K = np.linspace(0.0, 1.0, len(near.seconds))
+    off = replace(near, temperature=near.temperature + planted * change_K[:, None])
+    mean, rms = share_of_zero(off, test.environment, change_K, 0.01)
+    # A probe follows its place within 0.03 K, and its contact is known to 2 % of a rise of some kelvin.
+    assert mean == pytest.approx(planted, abs=0.15) and mean <= rms <= mean + 0.1
+    unknown = share_of_zero(off, None, change_K, 0.01)
+    assert unknown == pytest.approx((0.5, 1.0 / np.sqrt(3.0)), abs=0.01)
 
 
 def test_a_sensor_measures_the_scale_at_a_stated_place_and_elsewhere_only_contradicts_it() -> None:
