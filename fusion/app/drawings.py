@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import panel as pn
+from bokeh.document import Document
 from bokeh.models import Range1d
 from bokeh.plotting import figure
 
 from fusion.app.parts import schedule_update
+from fusion.report.charts.models import Model, document
 from fusion.report.charts.style import new_figure
 from interferometry.plots import INK
 
 #: First and last value of an axis as it is drawn; a descending pair turns it round.
 Ends: TypeAlias = tuple[float, float]
+
+
+def figure_of(drawn: Model) -> Any:
+    """Return a chart of the report as a model of the library, which a page changes while it is shown."""
+    read = Document.from_json(document(drawn))
+    (root,) = read.roots
+    read.clear()  # a model belongs to one document
+    return root
 
 
 def keep_scale(drawn: figure, x: Ends, y: Ends) -> figure:
@@ -34,7 +44,7 @@ def keep_scale(drawn: figure, x: Ends, y: Ends) -> figure:
 
 def scaled_drawing(x: Ends, y: Ends, *, x_name: str, y_name: str, width_px: int) -> figure:
     """Return an empty drawing to scale, at most `width_px` wide."""
-    drawn = keep_scale(new_figure(x=x_name, y=y_name), x, y)
+    drawn = keep_scale(figure_of(new_figure(x=x_name, y=y_name)), x, y)
     drawn.update(max_width=width_px)
     return drawn
 
@@ -43,6 +53,17 @@ def add_cross(drawn: figure, x: float, y: float) -> None:
     """Mark a place by a cross, dark on light, which is seen on any colour and on a dark page."""
     for colour, size, width in (("#ffffff", 20, 6), (INK, 18, 2.5)):
         drawn.scatter([x], [y], marker="cross", size=size, line_color=colour, line_width=width)
+
+
+def to_scale(drawn: figure) -> figure:
+    """Show a map of the report to scale in whatever width the page has."""
+    return keep_scale(drawn, *((ends.start, ends.end) for ends in (drawn.x_range, drawn.y_range)))
+
+
+def shown_chart(drawn: Model) -> pn.pane.Bokeh:
+    """Return a chart of the report as wide as the page leaves to it, a map to scale."""
+    made = figure_of(drawn)
+    return shown_drawing(to_scale(made) if made.name == "plan" else made)
 
 
 def shown_drawing(drawn: figure) -> pn.pane.Bokeh:

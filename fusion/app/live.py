@@ -11,7 +11,7 @@ import numpy as np
 import panel as pn
 
 from fusion.app import parts as ui
-from fusion.app.results.charts import shown_if, to_scale
+from fusion.app.results.charts import shown_if
 from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
 from fusion.common.messages import reported
@@ -105,7 +105,6 @@ def plot_field(course: Course) -> Chart | None:
     low, high = course.field_range_degC
     scale = {"low": low, "high": max(high, low + 0.1)}
     drawn = draw_map(shown.values, extent_of(shown.to_dataset(name="temperature")), LAYERS[1], scale)
-    to_scale(drawn)
     seen = f"Temperature of the table in cycle {number}: {span_words(shown, '°C')}."
     return Chart(drawn, seen, {})
 

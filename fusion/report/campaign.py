@@ -650,7 +650,9 @@ def _in_language(language: str, first: Mapping[str, Any], tiles: Sequence[Tile])
     """Return the first screen in a language, with what translates its headings."""
     tell = translation(language)
     words = {
-        key: [*map(tell, text)] if key == "next" else tell(text) for key, text in first.items() if key != "identity"
+        "open": tell(first["open"]),
+        "answers": {tell(name): tell(text) for name, text in first["answers"].items()},
+        "next": [*map(tell, first["next"])],
     }
     shown = [Tile(*map(tell, one)) for one in tiles]
     return {"language": language, "tell": tell, "first_screen": {**first, **words}, "tiles": shown}

@@ -36,6 +36,8 @@ def headline(results: Results) -> str:
 
 #: Most actions on the first screen, and words of each.
 _FIRST_STEPS, _WORDS = 3, 14
+#: Most of them on the terminal.
+_PRINTED_STEPS = 2
 _BRACKETS = re.compile(r" \([^()]*\)")
 #: Where a sentence may end before its end.
 _CLAUSE = re.compile(r"[;:] |, and | for ")
@@ -80,13 +82,23 @@ def first_screen(results: Results, report: Mapping[str, Any], axis: str, begun: 
             report.get("operator", ""),
             begun[:10] or "date not stated",
         ],
-        "decision": decision,
-        "unmet": "" if iso is None else say("unmet", iso),
-        "cause": _if_so(say("why", results)),
-        "map": "" if results.field is None else say("map_in_brief", results),
+        "answers": _told(
+            {
+                "Decision": decision,
+                "Acceptance": "" if iso is None else say("unmet", iso),
+                "Temperature" if alone else "Cause": _if_so(say("why", results)),
+                "Map": "" if results.field is None else say("map_in_brief", results.field),
+                "Place": _if_so(say("place_in_brief", results)),
+                "Position": _if_so(say("position_in_brief", results)),
+            }
+        ),
         "open": still_open,
         "next": [in_brief(step) for step in next_steps(results)[: _FIRST_STEPS - bool(still_open)]],
     }
+
+
+def _told(answers: Mapping[str, str]) -> dict[str, str]:
+    return {name: text for name, text in answers.items() if text}
 
 
 def _cameras(results: Results) -> str:
@@ -365,15 +377,17 @@ def _printed(results: Results, rows: list[tuple[str, str]], **looks: Any) -> ric
 def brief_rows(results: Results) -> list[tuple[str, str]]:
     """Return names and texts of what the first screen of the report says."""
     first = first_screen(results, {}, "", "")
-    steps = _numbered(first["next"])
-    rows = [
-        ("in doubt", first["open"]),
-        ("decision", first["decision"]),
-        ("cause", first["cause"]),
-        ("map", first["map"]),
-    ]
-    rows += [(one.tile.name, one.tile.value) for one in findings(results) if one.tile]
-    return [(name, text) for name, text in (*rows, ("next", steps)) if text]
+    # The largest rise stands above.
+    shown = [one.tile for one in findings(results) if one.tile and (one.code != "mean_rise" or results.iso230 is None)]
+    figures = "; ".join(f"{tile.name.removesuffix(', ISO 230-2')} {tile.value}" for tile in shown)
+    doubt, *_ = first["open"].split(". Assumed")
+    rows = {
+        "In doubt": doubt,
+        **first["answers"],
+        "Figures": figures,
+        "Next": _numbered(first["next"][:_PRINTED_STEPS]),
+    }
+    return [(name.lower(), text) for name, text in _told(rows).items() if name != "Acceptance"]
 
 
 def summary_rows(results: Results) -> list[tuple[str, str]]:

@@ -10,7 +10,7 @@ from bokeh.models import ColorBar, ColumnDataSource, HoverTool, LinearColorMappe
 from bokeh.plotting import figure
 
 from fusion.app import parts as ui
-from fusion.app.drawings import keep_scale, shown_drawing
+from fusion.app.drawings import figure_of, shown_chart, shown_drawing, to_scale
 from fusion.app.results.data import Place, Products, Selection
 from fusion.report.charts import readings
 from fusion.report.charts.plan import Layer, draw_followed, draw_map, draw_places, extent_of
@@ -21,7 +21,7 @@ from fusion.results.numbers import moment, number, place
 
 def shown(chart: Chart, caption: str) -> pn.viewable.Viewable:
     """Return a chart of the report with its caption and what is seen, in words."""
-    return ui.column(ui.paragraph(caption), shown_drawing(chart.figure), ui.note(chart.seen))
+    return ui.column(ui.paragraph(caption), shown_chart(chart.figure), ui.note(chart.seen))
 
 
 def shown_if(chart: Chart | None, caption: str) -> ui.Parts:
@@ -122,10 +122,10 @@ class ThermalView:
         correlation = results.correlation
         if correlation is not None and correlation.verdict == "attributable" and correlation.source.area is not None:
             draw_followed(drawn, correlation.source.area)
-        to_scale(drawn)
+        drawing = to_scale(figure_of(drawn))
         square = {"marker": "square", "size": 11, "fill_color": "colour", "line_color": "#ffffff", "line_width": 1.5}
-        drawn.scatter("x", "y", source=self._marks, **square)
-        return drawn
+        drawing.scatter("x", "y", source=self._marks, **square)
+        return drawing
 
     def _choose(self, cycle: int | None) -> None:
         """Choose the cycle with a number, or the nearest that there is."""
@@ -202,9 +202,4 @@ class ThermalView:
             span = f"{number(float(known.min()))} to {number(float(known.max()))}" if known.size else "no value"
             told.append(f"{one.words} (mean of {cells} cells): {span}" if cells > 1 else f"{one.words}: {span}")
         seen = ui.note(f"{quantity[:1].upper()}{quantity[1:]} over time. {'; '.join(told)}.")
-        self._history[:] = [shown_drawing(drawn), seen]
-
-
-def to_scale(drawn: figure) -> None:
-    """Show a map of the report to scale in whatever width the page has."""
-    keep_scale(drawn, *((ends.start, ends.end) for ends in (drawn.x_range, drawn.y_range)))
+        self._history[:] = [shown_chart(drawn), seen]

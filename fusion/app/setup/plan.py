@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import panel as pn
 from bokeh.events import Pan, PanEnd, PanStart, Tap
-from bokeh.models import Arrow, ColumnDataSource, LinearColorMapper, NormalHead
+from bokeh.models import Arrow, ColorBar, ColumnDataSource, HoverTool, LinearColorMapper, NormalHead
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 from numpy.typing import NDArray
@@ -23,8 +23,8 @@ from fusion.app.drawings import add_cross, scaled_drawing, shown_drawing
 from fusion.app.parts import beside, column, heading, markup, note, paragraph_markup, table
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.common import FusionError
-from fusion.report.charts.plan import add_names
-from fusion.report.charts.style import add_colour_bar, add_hover
+from fusion.report.charts.plan import NAME
+from fusion.report.charts.style import COLOUR_BAR
 from fusion.results.store import write_text
 from interferometry.plots import ACCENT, COLOURS, INK
 from thermography.common import Array, ThermographyError
@@ -49,8 +49,9 @@ def add_thermogram(drawn: figure, seen: Array, corner: tuple[float, float], size
     greys = LinearColorMapper(_GREYS, low=low, high=high, nan_color="#ffffff")
     (x, y), (width, height) = corner, size
     cells = drawn.image([seen.astype(np.float32)], x=x, y=y, dw=width, dh=height, color_mapper=greys)
-    add_hover(drawn, [("x, y", "$x{0}, $y{0}"), ("temperature", "@image{0.00} °C")], [cells])
-    add_colour_bar(drawn, greys, "temperature / °C")
+    tips = [("x, y", "$x{0}, $y{0}"), ("temperature", "@image{0.00} °C")]
+    drawn.add_tools(HoverTool(tooltips=tips, renderers=[cells]))
+    drawn.add_layout(ColorBar(color_mapper=greys, title="temperature / °C", height=10, **COLOUR_BAR), "below")
 
 
 # Fiducials in a thermogram: found by the registration, or placed by hand with the residual of every place.
@@ -479,7 +480,7 @@ class PlanView:
         drawn.text(x, y, names, x_offset=7, y_offset=-4, text_color=TEAL, background_fill_alpha=0.75, **_LABEL)
         if not in_px:
             add_cross(drawn, 0.0, 0.0)
-            add_names(drawn, [0], [0], ["origin"], x_offset=6, y_offset=16)
+            drawn.text([0], [0], ["origin"], x_offset=6, y_offset=16, **NAME)
         for name, corners in plan.regions:
             drawn.patch(*corners.T.tolist(), fill_color=ACCENT, fill_alpha=0.15, line_color=ACCENT, line_width=2)
             drawn.scatter(*corners.T.tolist(), marker="circle", size=5, color=ACCENT)

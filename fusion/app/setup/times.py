@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import panel as pn
 from bokeh.models import ColumnDataSource
 
+from fusion.app.drawings import figure_of, shown_drawing
 from fusion.app.parts import column, heading, markup, paragraph_markup
 from fusion.app.setup.plan import TEAL
 from fusion.campaign.inspect import Recording
@@ -44,11 +45,12 @@ class TimesView:
         self._slider.visible = FRAMES in names and len(names) > 1
         if not names:
             return
-        drawn = new_figure(x="UTC", y="", x_type="datetime", y_range=names[::-1], height=70 + 34 * len(names))
+        empty = new_figure(x="UTC", y="", x_type="datetime", y_range=names[::-1], height=70 + 34 * len(names))
+        drawn = figure_of(empty)
         drawn.hbar(y="name", left="start", right="end", height=0.5, source=self._bars, color="colour")
         drawn.ygrid.grid_line_color = None
         self.move(clock_offset_s)
-        self._picture[:] = [pn.pane.Bokeh(drawn, sizing_mode="stretch_width")]
+        self._picture[:] = [shown_drawing(drawn)]
 
     def move(self, clock_offset_s: float) -> None:
         """Show the recordings with another offset."""

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from bokeh.models import BoxAnnotation, DatetimeTickFormatter, NoOverlap
 
 from fusion.analysis.comparison import ComparedCampaign, PairComparison, common_to_all, contributions
 from fusion.report.charts.style import (
@@ -23,6 +22,7 @@ from fusion.report.charts.style import (
     fix_range,
     new_figure,
     of_rank,
+    shade,
     shared_range,
     span_words,
 )
@@ -110,11 +110,8 @@ def plot_remaining(pair: PairComparison) -> Chart | None:
     told = [f"{place:g} mm" for place in places]
     for one in changed:
         if one.quantity in _RUNS:
-            drawn.add_layout(
-                BoxAnnotation(
-                    left=one.position_mm, right=one.until_mm, fill_color=ACCENT, fill_alpha=0.08, level="underlay"
-                )
-            )
+            assert one.position_mm is not None
+            shade(drawn, one.position_mm, one.until_mm, 0.08)
             told.append(f"from {one.position_mm:g} mm " + ("on" if one.until_mm is None else f"to {one.until_mm:g} mm"))
     marked = f"changed: {', '.join(told)}" if told else "no position changed"
     seen = f"Difference of the profiles beyond offset, slope and bow: {span_words(value, 'µm')}; {marked}."
@@ -187,10 +184,6 @@ def draw_trend(trend: Trend) -> Chart:
     """Draw a quantity over dates with its error bars, its control limits and its tolerance; values outside the limits are ringed."""
     name, unit, when, value, half, limits = trend.name, trend.unit, trend.when, trend.value, trend.half, trend.limits
     drawn = new_figure(x="date", y=f"{name} / {unit}", x_type="datetime", height=240)
-    drawn.xaxis[0].update(
-        formatter=DatetimeTickFormatter(days="%Y-%m-%d", months="%Y-%m", years="%Y"),
-        major_label_policy=NoOverlap(min_distance=8),
-    )
     add_series(drawn, when, value, name=name, colour=CATEGORIES[0], marker="circle", half=half, legend=False)
     seen = f"{name} of {value.size} tests: {span_words(value, unit)}"
     drawn_um = [value - half, value + half]

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from bokeh.models import FixedTicker, LinearColorMapper
-from bokeh.plotting import figure
 
 from fusion.analysis.levels import ATTRIBUTION_LEVEL
+from fusion.report.charts.models import Figure
 from fusion.report.charts.plan import Extent, add_cells, add_marks, extent_of, new_plan
 from fusion.report.charts.style import (
     BEFORE,
@@ -22,6 +21,8 @@ from fusion.report.charts.style import (
     add_series,
     draw,
     fix_range,
+    fixed_ticks,
+    mapper,
     new_figure,
     of_direction,
     of_rank,
@@ -42,7 +43,7 @@ _P_COLOURS = ("#3b0f70", "#b63679", "#fbb18b")
 _P_NAMES = {0.5: "≤ 0.01", 1.5: "≤ 0.05", 2.5: "≤ 0.1"}
 
 
-def _add_blank(drawn: figure, extent: Extent, name: str) -> None:
+def _add_blank(drawn: Figure, extent: Extent, name: str) -> None:
     """Hatch the plan, which shows wherever no cell is coloured."""
     left, right, bottom, top = extent
     draw(
@@ -63,12 +64,12 @@ def plot_sensitivity(maps: xr.Dataset, channel: str) -> Chart:
     values, p = chosen["sensitivity"].values, chosen["p_value"].fillna(1.0).values
     passed = p <= ATTRIBUTION_LEVEL
     limit = float(np.nanmax(np.abs(values[passed]))) if passed.any() else 1.0
-    mapper = LinearColorMapper(palette(DIVERGING), low=-limit, high=limit, nan_color="rgba(0, 0, 0, 0)")
+    colours = mapper(palette(DIVERGING), -limit, limit, nan_color="rgba(0, 0, 0, 0)")
     drawn = new_plan(extent, title=CHANNELS.get(channel, channel))
     _add_blank(drawn, extent, "not significant (p > 0.05)")
     tips = [("sensitivity", "@own{0.00} µm/K"), ("family-wise p", "@p{0.000}")]
-    add_cells(drawn, np.where(passed, values, np.nan), extent, mapper, tips, own=values, p=p)
-    add_colour_bar(drawn, mapper, "sensitivity / (µm/K)")
+    add_cells(drawn, np.where(passed, values, np.nan), extent, colours, tips, own=values, p=p)
+    add_colour_bar(drawn, colours, "sensitivity / (µm/K)")
     return Chart(
         drawn,
         _where(maps, passed, p, f"sensitivity {span_words(values[passed], 'µm/K')}" if passed.any() else ""),
@@ -80,15 +81,15 @@ def plot_significance(maps: xr.Dataset, channel: str) -> Chart:
     """Draw the family-wise p-value of every cell in steps; cells above 0.1 are hatched."""
     extent, p = extent_of(maps), maps["p_value"].sel(channel=channel).fillna(1.0).values
     step = np.digitize(p, _P_STEPS, right=True).astype(float)
-    mapper = LinearColorMapper(list(_P_COLOURS), low=0.0, high=float(len(_P_STEPS)), nan_color="rgba(0, 0, 0, 0)")
+    colours = mapper(_P_COLOURS, 0.0, float(len(_P_STEPS)), nan_color="rgba(0, 0, 0, 0)")
     drawn = new_plan(extent, title=CHANNELS.get(channel, channel))
     _add_blank(drawn, extent, "p > 0.1")
     blank = step == len(_P_STEPS)
-    add_cells(drawn, np.where(blank, np.nan, step + 0.5), extent, mapper, [("family-wise p", "@p{0.000}")], p=p)
+    add_cells(drawn, np.where(blank, np.nan, step + 0.5), extent, colours, [("family-wise p", "@p{0.000}")], p=p)
     # Names instead of numbers.
-    add_colour_bar(drawn, mapper, "family-wise p")
-    (bar,) = (part for part in drawn.below if getattr(part, "color_mapper", None) is mapper)
-    bar.ticker, bar.major_label_overrides = FixedTicker(ticks=list(_P_NAMES)), dict(_P_NAMES)
+    add_colour_bar(drawn, colours, "family-wise p").update(
+        ticker=fixed_ticks([*_P_NAMES]), major_label_overrides=_P_NAMES
+    )
     return Chart(drawn, _where(maps, p <= ATTRIBUTION_LEVEL, p, ""), _cell_columns(maps, **{"family-wise p": p}))
 
 
@@ -108,12 +109,12 @@ def plot_mode(modes: xr.Dataset, mode: int, channel: str, least_p: float | None 
     significant = p <= ATTRIBUTION_LEVEL
     title = f"mode {mode}: {'significant, ' if significant else ''}p {p_cell(p, least_p)}, lag {duration(lag)}"
     drawn = new_plan(extent, title=title)
-    mapper = LinearColorMapper(palette("PuOr_r"), low=-1.0, high=1.0, nan_color="#e1e5e7")
+    colours = mapper(palette("PuOr_r"), -1.0, 1.0, nan_color="#e1e5e7")
     pattern = one["pattern"].values
-    add_cells(drawn, pattern, extent, mapper, [("warming relative to the cross", "@image{0.00}")])
+    add_cells(drawn, pattern, extent, colours, [("warming relative to the cross", "@image{0.00}")])
     x, y = float(one["at_x"]), float(one["at_y"])
     add_marks(drawn, [x], [y], "cross", 14)
-    add_colour_bar(drawn, mapper, "warming relative to the cross")
+    add_colour_bar(drawn, colours, "warming relative to the cross")
     seen = (
         f"Thermal mode {mode}, strongest at x {x:.0f} mm, y {y:.0f} mm; it {'correlates' if significant else 'does not correlate'} with "
         f"the {CHANNELS.get(channel, channel)} ({p_words(p, least_p)})."

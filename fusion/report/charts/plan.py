@@ -7,10 +7,9 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import xarray as xr
-from bokeh.models import Arrow, ColorMapper, ColumnDataSource, GlyphRenderer, HoverTool, LinearColorMapper, NormalHead
-from bokeh.plotting import figure
 
 from fusion.report.charts.embedded import MapControls
+from fusion.report.charts.models import Figure, Model, source
 from fusion.report.charts.style import (
     CATEGORIES,
     DIVERGING,
@@ -23,6 +22,7 @@ from fusion.report.charts.style import (
     add_ordered_lines,
     add_series,
     draw,
+    mapper,
     new_figure,
     palette,
     span_words,
@@ -55,7 +55,7 @@ def extent_of(cells: xr.Dataset) -> Extent:
     return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
 
-def new_plan(extent: Extent, *, title: str = "") -> figure:
+def new_plan(extent: Extent, *, title: str = "") -> Figure:
     """Return an empty plan view of the table as the camera sees it: x to the right, y downwards from its origin, which is marked.
 
     ``templates/charts.js`` keeps a millimetre as long in both directions in whatever width the page has.
@@ -66,31 +66,38 @@ def new_plan(extent: Extent, *, title: str = "") -> figure:
     height = round(min(420.0, 560 * (top - bottom) / (right - left))) + 110
     drawn = new_figure(x="x / mm", y="y / mm", title=title, height=height, **ranges)
     drawn.name = "plan"
-    drawn.grid.grid_line_color = None
+    drawn.set_grid(grid_line_color=None)
     if left <= 0 <= right and bottom <= 0 <= top:
         add_marks(drawn, [0], [0], "cross", 16)
-        add_names(drawn, [0], [0], ["origin"], x_offset=6, y_offset=16)
+        add_names(drawn, [0], [0], ["origin"], x_offset=6, y_offset=16).name = ASIDE
     return drawn
 
 
 def add_cells(
-    drawn: figure, values: np.ndarray, extent: Extent, mapper: ColorMapper, tips: Tips, **layers: np.ndarray
-) -> GlyphRenderer:
+    drawn: Figure, values: np.ndarray, extent: Extent, colours: Model, tips: Tips, **layers: np.ndarray
+) -> Model:
     """Draw values on the plan; NaN show what is below."""
     left, right, bottom, top = extent
-    source = {name: [each.astype(np.float32)] for name, each in {"image": values, **layers}.items()}
+    held = source({name: [each.astype(np.float32)] for name, each in {"image": values, **layers}.items()})
     place: dict[str, Any] = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom}
-    cells = draw(drawn, "Image", image="image", **place, color_mapper=mapper, source=source, level="image")
+    cells = draw(drawn, "Image", image="image", **place, color_mapper=colours, columns=held, level="image")
     add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), *tips], [cells])
     return cells
 
 
-def add_names(drawn: figure, x: Any, y: Any, names: Any, **options: Any) -> None:
-    """Write names on a map, light on dark, which reads on every colour."""
-    draw(
-        drawn, "Text", x=x, y=y, text=names, text_color="#ffffff", text_font_size="12px", background_fill_color=INK,
-        background_fill_alpha=0.75, padding=2, **options,
-    )  # fmt: skip
+#: Looks of a name on a map, light on dark, which reads on every colour.
+NAME: dict[str, Any] = {
+    "text_color": "#ffffff", "text_font_size": "12px", "background_fill_color": INK, "background_fill_alpha": 0.75, "padding": 2,
+}  # fmt: skip
+
+
+#: Name of what a map on a narrow screen has no room for.
+ASIDE = "aside"
+
+
+def add_names(drawn: Figure, x: Any, y: Any, names: Any, **options: Any) -> Model:
+    """Write names on a map."""
+    return draw(drawn, "Text", x=x, y=y, text=names, **NAME, **options)
 
 
 def draw_picture(
@@ -102,15 +109,14 @@ def draw_picture(
     colours: str = SEQUENTIAL,
     block: int = 1,
     marked: bool = False,
-) -> figure:
+) -> Figure:
     """Draw a picture, each value of a block of pixels, row 0 at the top, with the scale of its values; NaN stay grey.
 
     Where `marked`, what lies beyond the ends of the scale has a colour of its own.
     """
     rows, columns = (block * size for size in values.shape)
-    mapper = LinearColorMapper(palette(colours), low=low, high=high, nan_color="#e1e5e7")
-    if marked:
-        mapper.low_color = mapper.high_color = BEYOND
+    beyond = {"low_color": BEYOND, "high_color": BEYOND} if marked else {}
+    scale = mapper(palette(colours), low, high, nan_color="#e1e5e7", **beyond)
     room = _ROOM * columns
     ranges: dict[str, Any] = {
         "x_range": (-0.5 - room, columns - 0.5 + room),
@@ -120,13 +126,13 @@ def draw_picture(
     width, beside, below = 520, 120, 55
     drawn = new_figure(x="column / px", y="row / px", height=round((width - beside) * rows / columns) + below, **ranges)
     drawn.update(width=width, sizing_mode="scale_width")
-    drawn.grid.grid_line_color = None
+    drawn.set_grid(grid_line_color=None)
     rounded = np.round(values * _STEP_PER_K) / _STEP_PER_K
     place = {"x": -0.5, "y": -0.5, "dw": columns, "dh": rows}
-    picture = draw(drawn, "Image", image=[rounded.astype(np.float32)], **place, color_mapper=mapper, level="image")
+    picture = draw(drawn, "Image", image=[rounded.astype(np.float32)], **place, color_mapper=scale, level="image")
     name, _, unit = label.partition(" / ")
     add_hover(drawn, [("column", "$x{0}"), ("row", "$y{0}"), (name, f"@image{{0.00}} {unit}")], [picture])
-    add_colour_bar(drawn, mapper, label, place="right")
+    add_colour_bar(drawn, scale, label, place="right")
     return drawn
 
 
@@ -141,10 +147,10 @@ def plot_registration(
     names = [str(name) for name in fields["fiducial_name"].values]
     column, row = fields["fiducial_column"].values, fields["fiducial_row"].values
     residual = fields["fiducial_residual"].values
-    source = {"column": column, "row": row, "name": names, "residual": residual}
+    held = source({"column": column, "row": row, "name": names, "residual": residual})
     looks: dict[str, Any] = {"marker": "circle", "size": 13, "fill_alpha": 0.0, "line_color": "#7fe3ff"}
-    rings = draw(drawn, "Scatter", x="column", y="row", source=source, line_width=2, **looks)
-    add_names(drawn, "column", "row", "name", source=source, x_offset=9, y_offset=-4)
+    rings = draw(drawn, "Scatter", x="column", y="row", columns=held, line_width=2, **looks)
+    add_names(drawn, "column", "row", "name", columns=held, x_offset=9, y_offset=-4)
     if "target_x" in fields:
         draw_both(drawn, *_to_frame(fields, fields["target_x"].values, fields["target_y"].values))
     if followed is not None:
@@ -188,7 +194,7 @@ def _rim(area: AreaPart) -> tuple[np.ndarray, np.ndarray]:
     return np.interp(share, corners, x), np.interp(share, corners, y)
 
 
-def draw_both(drawn: figure, x: np.ndarray, y: np.ndarray) -> None:
+def draw_both(drawn: Figure, x: np.ndarray, y: np.ndarray) -> None:
     """Draw a line dark under light, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 1.6)):
         draw(drawn, "Line", x=x, y=y, line_color=colour, line_width=width)
@@ -255,15 +261,16 @@ def plot_contact_sheet(fields: xr.Dataset) -> Chart:
     pixels = round(min(640.0, 520 * sheet[2] / sheet[1])) + 70
     drawn = new_figure(x="", y="", height=pixels, x_range=sheet[:2], y_range=sheet[2:])
     drawn.name = "plan"
-    drawn.axis.visible = drawn.grid.visible = False
-    mapper = LinearColorMapper(palette(SEQUENTIAL), low=scale["low"], high=scale["high"], nan_color="#e1e5e7")
+    drawn.set_grid(visible=False)
+    drawn.xaxis.visible = drawn.yaxis.visible = False
+    colours = mapper(palette(SEQUENTIAL), scale["low"], scale["high"], nan_color="#e1e5e7")
     names = [f"cycle {cycle}" for cycle in cycles]
-    source = {"image": list(rise.values.astype(np.float32)), "x": x, "y": y, "cycle": names}
+    held = source({"image": list(rise.values.astype(np.float32)), "x": x, "y": y, "cycle": names})
     place: dict[str, Any] = {"x": "x", "y": "y", "dw": width, "dh": height}
-    maps = draw(drawn, "Image", image="image", **place, color_mapper=mapper, source=source, level="image")
+    maps = draw(drawn, "Image", image="image", **place, color_mapper=colours, columns=held, level="image")
     add_hover(drawn, [("", "@cycle"), LAYERS[0].tip], [maps])
     draw(drawn, "Text", x=x, y=y - 0.01 * width, text=names, text_font_size="11px", text_color=INK)
-    add_colour_bar(drawn, mapper, "rise / K")
+    add_colour_bar(drawn, colours, "rise / K")
     seen = f"Rise of the table in {len(cycles)} of {count} cycles on one scale: {span_words(rise.values, 'K')}."
     cells = rise.stack(cell=("cycle", "y", "x"))
     columns = {"cycle": cells["cycle"].values, "x / mm": cells["x"].values, "y / mm": cells["y"].values}
@@ -410,36 +417,34 @@ def plot_thermal_map(
         draw_followed(drawn, followed)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
-    drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
+    drawn.tags = [source(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
     cycle = int(kept["cycle"][-1])
     chart = Chart(drawn, _seen(kept, last, hotspots, cycle, standing_out), _columns(kept, shown, cycle))
     return chart, MapControls([layer.words for layer in shown], kept["cycle"].values.tolist(), note)
 
 
-def draw_followed(drawn: figure, area: AreaPart) -> None:
+def draw_followed(drawn: Figure, area: AreaPart) -> None:
     """Draw the area whose temperature the drift follows."""
     draw_both(drawn, *_rim(area))
-    middle = (area.x_low_mm + area.x_high_mm) / 2
-    place = {"y_offset": 2, "text_baseline": "top", "text_align": "center"}
-    add_names(drawn, [middle], [area.y_high_mm], ["the drift follows this"], **place)
+    middle, bottom = (area.x_low_mm + area.x_high_mm) / 2, drawn.y_range.start
+    # Below the area where there is room, which is counted downwards.
+    below = bottom - area.y_high_mm > 0.12 * (bottom - drawn.y_range.end)
+    place: dict[str, Any] = {"y_offset": 2 if below else -3, "text_baseline": "top" if below else "bottom"}
+    add_names(drawn, [middle], [area.y_high_mm], ["the drift follows this"], text_align="center", **place).name = ASIDE
 
 
-def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[str, Any]) -> figure:
+def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[str, Any]) -> Figure:
     """Draw one quantity in one cycle on the plan of the table."""
     left, right, bottom, top = extent
     room = _ROOM * (right - left)
     drawn = new_plan((left - room, right + room, bottom - room, top + room))
-    mapper = LinearColorMapper(
-        palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=BEYOND, high_color=BEYOND,
-        name="scale",
-    )  # fmt: skip
+    ends: dict[str, Any] = {"low_color": BEYOND, "high_color": BEYOND}
+    colours = mapper(palette(layer.colours), scale["low"], scale["high"], nan_color="#e1e5e7", name="scale", **ends)
     place: dict[str, Any] = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom}
-    cells = draw(drawn, "Image", image=[values.astype(np.float32)], **place, color_mapper=mapper, level="image")
+    cells = draw(drawn, "Image", image=[values.astype(np.float32)], **place, color_mapper=colours, level="image")
     cells.name = "cells"
-    add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), layer.tip], [cells])
-    drawn.select_one(HoverTool).name = "reading"
-    add_colour_bar(drawn, mapper, f"{layer.words} / {layer.unit}")
-    drawn.below[-1].name = "bar"
+    add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), layer.tip], [cells]).name = "reading"
+    add_colour_bar(drawn, colours, f"{layer.words} / {layer.unit}").name = "bar"
     return drawn
 
 
@@ -482,7 +487,7 @@ def scale_of(values: np.ndarray, layer: Layer) -> dict[str, Any]:
 
 
 def draw_places(
-    drawn: figure,
+    drawn: Figure,
     fields: xr.Dataset,
     position: xr.DataArray | None,
     hotspots: Sequence[HotspotPart],
@@ -495,7 +500,7 @@ def draw_places(
     _draw_sensors(drawn, sensors)
 
 
-def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None) -> None:
+def _draw_line(drawn: Figure, fields: xr.Dataset, position: xr.DataArray | None) -> None:
     """Draw the measured line with an arrow to its positive end, its targets, and the numbers of the first and the last."""
     targets = fields["target"].values
     order = np.arange(targets.size)
@@ -506,16 +511,16 @@ def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None)
     for colour, size in ((INK, 7), ("#ffffff", 4.6)):
         draw(drawn, "Scatter", x=x, y=y, marker="circle", size=size, line_color=colour, fill_color=colour)
     if x.size > 1:
-        head = NormalHead(size=11, fill_color="#ffffff", line_color=INK)
+        head = Model("NormalHead", size=11, fill_color="#ffffff", line_color=INK)
         along = np.array([x[-1] - x[-2], y[-1] - y[-2]])
         along *= 1.6 * _ROOM * (drawn.x_range.end - drawn.x_range.start) / (np.hypot(*along) or 1.0)
         ends = {"x_start": x[-1], "y_start": y[-1], "x_end": x[-1] + along[0], "y_end": y[-1] + along[1]}
-        drawn.add_layout(Arrow(**ends, end=head, line_color="#ffffff", line_width=2))
+        drawn.add(Model("Arrow", **ends, end=head, line_color="#ffffff", line_width=2))
     named = sorted({0, x.size - 1})
     add_names(drawn, x[named], y[named], [f"{targets[order[k]]}" for k in named], y_offset=-7, text_align="center")
 
 
-def _ring_targets(drawn: figure, fields: xr.Dataset, targets: Set[int]) -> None:
+def _ring_targets(drawn: Figure, fields: xr.Dataset, targets: Set[int]) -> None:
     """Ring the targets that stand out and name them, below the line whose ends are numbered above it."""
     shown = [target for target in sorted(targets) if "target_x" in fields and target in fields["target"].values]
     if not shown:
@@ -531,7 +536,7 @@ def _span(spot: HotspotPart) -> str:
     return "" if spot.end_cycle is None else f" (cycle {spot.onset_cycle} to {spot.end_cycle})"
 
 
-def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart]) -> None:
+def _draw_hotspots(drawn: Figure, hotspots: Sequence[HotspotPart]) -> None:
     """Ring the peak of every hotspot and write its name."""
     if not hotspots:
         return
@@ -542,7 +547,7 @@ def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart]) -> None:
     add_names(drawn, x, y, names, y_offset=-13, text_align=["right" if at > middle else "left" for at in x])
 
 
-def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
+def _draw_sensors(drawn: Figure, sensors: Sequence[ContactSensorPart]) -> None:
     """Mark the places of the contact sensors by squares with their names; faulty ones are crossed."""
     for marker, used in (("square", True), ("square_x", False)):
         shown = [sensor for sensor in sensors if sensor.used is used]
@@ -554,7 +559,7 @@ def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
         add_names(drawn, x, y, names, y_offset=16, text_align="center", text_baseline="middle")
 
 
-def add_marks(drawn: figure, x: Any, y: Any, marker: str, size: int, **options: Any) -> None:
+def add_marks(drawn: Figure, x: Any, y: Any, marker: str, size: int, **options: Any) -> None:
     """Draw hollow marks, light on dark, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 2)):
         looks = {"fill_color": None, "line_color": colour, "line_width": width, **options}

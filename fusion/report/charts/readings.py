@@ -7,11 +7,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from bokeh.layouts import column
-from bokeh.models import BoxAnnotation, LayoutDOM, Whisker
-from bokeh.models.sources import ColumnDataSource
-from bokeh.plotting import figure
 
+from fusion.report.charts.models import Figure, Model, field, source
 from fusion.report.charts.style import (
     CATEGORIES,
     MARKERS,
@@ -22,12 +19,14 @@ from fusion.report.charts.style import (
     add_label,
     add_ordered_lines,
     add_series,
+    column,
     draw,
     fix_range,
     literal,
     new_figure,
     of_direction,
     ordered_colours,
+    shade,
     shared_range,
     span_words,
 )
@@ -109,8 +108,7 @@ def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Se
     drawn = new_figure(x="position / mm", y="scatter s / µm")
     for target in sorted(flagged):
         place = float(position.sel(target=target))
-        sides = {"left": place - 0.4 * step, "right": place + 0.4 * step}
-        drawn.add_layout(BoxAnnotation(**sides, fill_color=ACCENT, fill_alpha=0.12, level="underlay"))
+        shade(drawn, place - 0.4 * step, place + 0.4 * step, 0.12)
     courses, highest = Courses(drawn, {"position / mm": x}), 0.0
     for shift, direction in zip((-0.12, 0.12), drift["direction"].values, strict=False):
         row = drift.sel(direction=direction)
@@ -148,15 +146,14 @@ def plot_test(quoted: xr.Dataset, position: xr.DataArray) -> Chart:
             continue
         name = ARROWS[direction]
         add_band(drawn, x, mean - 2 * s, mean + 2 * s, COLOURS[direction])
-        source = ColumnDataSource({"x": x, "y": mean, "low": mean - 2 * s, "high": mean + 2 * s, "s": s})
+        held = source({"x": x, "y": mean, "low": mean - 2 * s, "high": mean + 2 * s, "s": s})
         colour = COLOURS[direction]
-        draw(drawn, "Line", x="x", y="y", source=source, line_width=1.6, line_color=colour, named=name)
-        whisker = Whisker(base="x", upper="high", lower="low", source=source, line_color=COLOURS[direction])
-        for head in (whisker.upper_head, whisker.lower_head):
-            head.update(line_color=COLOURS[direction], size=8)
-        drawn.add_layout(whisker)
+        draw(drawn, "Line", x="x", y="y", columns=held, line_width=1.6, line_color=colour, named=name)
+        heads = {f"{side}_head": Model("TeeHead", line_color=colour, size=8) for side in ("upper", "lower")}
+        ends = {"base": field("x"), "upper": field("high"), "lower": field("low")}
+        drawn.add(Model("Whisker", **ends, **heads, source=held, line_color=colour))
         points = draw(
-            drawn, "Scatter", x="x", y="y", source=source, named=name, marker=MARKERS[direction], size=7, line_color=colour,
+            drawn, "Scatter", x="x", y="y", columns=held, named=name, marker=MARKERS[direction], size=7, line_color=colour,
             fill_color=colour,
         )  # fmt: skip
         tips = [("position", f"@x{{0.###}} {along}"), (f"mean {name}", f"@y{{0.00}} {unit}")]
@@ -170,7 +167,7 @@ def plot_test(quoted: xr.Dataset, position: xr.DataArray) -> Chart:
     return Chart(drawn, _seen(quoted, x, unit, along), columns)
 
 
-def _mark_spans(drawn: figure, quoted: xr.Dataset, end: float, room: float) -> None:
+def _mark_spans(drawn: Figure, quoted: xr.Dataset, end: float, room: float) -> None:
     """Draw the spans of A and E to the right of the data, where both approaches were measured, else those of the one approach."""
     mean, s = quoted["mean_unidirectional"].values, quoted["standard_deviation"].values
     # Labels are at two heights: at one height they would be written over each other.
@@ -188,7 +185,7 @@ def _mark_spans(drawn: figure, quoted: xr.Dataset, end: float, room: float) -> N
         add_label(drawn, at, bottom + height * (top - bottom), f"{symbol} {number(top - bottom)}", **looks)
 
 
-def _mark_reversal(drawn: figure, quoted: xr.Dataset, x: np.ndarray) -> None:
+def _mark_reversal(drawn: Figure, quoted: xr.Dataset, x: np.ndarray) -> None:
     """Draw the reversal error B at the target where it is largest."""
     reversal = quoted["reversal"].values
     k = int(np.nanargmax(np.abs(reversal)))
@@ -367,12 +364,12 @@ def plot_timeline(fused: xr.Dataset) -> Chart:
     spans = {name: recorded_spans(hours) for name, hours in recorded.items()}
     bars = _plot_spans(spans)
     series = [str(name) for name in fused.data_vars if fused[name].dims in (("environment_time",), ("driver_time",))]
-    below: list[figure] = []
+    below: list[Figure] = []
     for at, name in enumerate(series):
         below.append(_plot_series(fused[name], _hours(fused[fused[name].dims[0]].values, start), at, bars))
     for drawn in (bars, *below)[:-1]:
         drawn.xaxis.axis_label = None
-    shown: LayoutDOM = column(bars, *below, sizing_mode="stretch_width") if below else bars
+    shown = column([bars, *below]) if below else bars
     gaps = [f"{name} {len(parts) - 1}" for name, parts in spans.items() if len(parts) > 1]
     units = {name: print_unit(str(fused[name].attrs.get("units", "1"))) for name in series}
     said = [f"{_words(fused[name])} {span_words(fused[name], unit)}" for name, unit in units.items()]
@@ -405,7 +402,7 @@ def _hours(times: np.ndarray, start: np.datetime64) -> np.ndarray:
     return np.asarray(hours[np.isfinite(hours)], float)
 
 
-def _plot_spans(spans: dict[str, list[tuple[float, float]]]) -> figure:
+def _plot_spans(spans: dict[str, list[tuple[float, float]]]) -> Figure:
     """Draw one bar for every span of every recording."""
     names = list(spans)
     every = [end for parts in spans.values() for part in parts for end in part]
@@ -413,20 +410,20 @@ def _plot_spans(spans: dict[str, list[tuple[float, float]]]) -> figure:
     drawn = new_figure(x=_TIME, y="", height=60 + 22 * len(names), y_range=names[::-1], x_range=(low, high))
     for at, name in enumerate(names):
         parts = spans[name]
-        source = {"y": [name] * len(parts), "left": [part[0] for part in parts], "right": [part[1] for part in parts]}
+        ends = {"left": [part[0] for part in parts], "right": [part[1] for part in parts]}
         colours = {"line_color": CATEGORIES[at], "fill_color": CATEGORIES[at]}
-        bar = draw(drawn, "HBar", y="y", left="left", right="right", height=0.55, source=source, **colours)
+        bar = draw(drawn, "HBar", y=[name] * len(parts), **ends, height=0.55, **colours)
         add_hover(drawn, [("", name), ("from", "@left{0.00} h"), ("to", "@right{0.00} h")], [bar])
     return drawn
 
 
-def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: figure) -> figure:
+def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: Figure) -> Figure:
     """Draw one logged quantity below the bars, on the same time axis."""
     unit = print_unit(str(values.attrs.get("units", "1")))
     words = _words(values)
     drawn = new_figure(x=_TIME, y=unit, title=words, height=118)
     drawn.x_range = above.x_range
-    drawn.yaxis.ticker.desired_num_ticks = 3
+    drawn.yaxis.ticker = Model("BasicTicker", desired_num_ticks=3)
     low, high = shared_range(values.values)
     fix_range(drawn, low, high)
     line = draw(drawn, "Line", x=hours, y=values.values, line_color=CATEGORIES[at % len(CATEGORIES)], line_width=1.7)

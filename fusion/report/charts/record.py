@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from bokeh.layouts import column
-from bokeh.models import Plot
-from bokeh.plotting import figure
 
 from fusion.common import own_name
 from fusion.report.campaign import DRAWN, shown_channels
 from fusion.report.charts.model import plot_block_errors
+from fusion.report.charts.models import Figure, source
 from fusion.report.charts.style import (
     BEFORE,
     CATEGORIES,
@@ -23,6 +21,7 @@ from fusion.report.charts.style import (
     add_hold_out,
     add_hover,
     add_series,
+    column,
     draw,
     fix_range,
     new_figure,
@@ -94,9 +93,9 @@ def plot_temperatures(record: xr.Dataset) -> Chart:
     drawn = new_figure(x=_TIME, y="rise / K", height=340, zero=True)
     others = order[_NAMED:]
     if others.size:
-        source = {"xs": [hours] * others.size, "ys": list(rise.T[others]), "name": [names[k] for k in others]}
+        held = source({"xs": [hours] * others.size, "ys": list(rise.T[others]), "name": [names[k] for k in others]})
         looks: dict[str, Any] = {"xs": "xs", "ys": "ys", "line_color": _PALE, "line_width": 1.1}
-        lines = draw(drawn, "MultiLine", source=source, named="other sensors", hovered={"line_color": INK}, **looks)
+        lines = draw(drawn, "MultiLine", columns=held, named="other sensors", hovered={"line_color": INK}, **looks)
         add_hover(drawn, [("sensor", "@name"), ("time", "$x{0.00} h"), ("rise", "$y{0.00} K")], [lines])
     for rank, k in enumerate(order[:_NAMED]):
         add_series(drawn, hours, rise[:, k], name=names[k], width=2.0, **of_rank(rank))
@@ -108,7 +107,7 @@ def plot_drivers(record: xr.Dataset) -> Chart:
     """Draw every driver in its own unit, one below the other on one time axis."""
     hours = hours_of(record)
     columns: dict[str, np.ndarray] = {_TIME: hours}
-    parts: list[figure] = []
+    parts: list[Figure] = []
     said = []
     for k, name in enumerate(str(driver) for driver in record["driver_name"].values):
         unit = print_unit(str(record["driver_units"].values[k]))
@@ -121,7 +120,7 @@ def plot_drivers(record: xr.Dataset) -> Chart:
         parts.append(drawn)
         columns[own_name(f"{name} / {unit}" if unit else name, columns)] = values
         said.append(f"{name} {span_words(values, unit).strip()}")
-    shown: Plot = parts[0] if len(parts) == 1 else column(*parts, sizing_mode="stretch_width")
+    shown = parts[0] if len(parts) == 1 else column(parts)
     return Chart(shown, f"Logged drivers over time: {'; '.join(said)}.", columns)
 
 
@@ -137,7 +136,7 @@ def plot_contributions(record: xr.Dataset, channel: str) -> Chart:
     return courses.chart(f"Contributions to {channel} over time")
 
 
-def _shade_hold_out(record: xr.Dataset, drawn: figure) -> None:
+def _shade_hold_out(record: xr.Dataset, drawn: Figure) -> None:
     """Shade the hold-out, each run that is held out separately."""
     hours, held_out = hours_of(record), record["sealed"].values
     run = record["run"].values if "run" in record else np.zeros(hours.size, int)

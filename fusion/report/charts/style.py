@@ -6,40 +6,15 @@ import html
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeAlias
 
-import bokeh
 import numpy as np
 import xarray as xr
-from bokeh import palettes
-from bokeh.core.properties import value
-from bokeh.core.serialization import Serializer
-from bokeh.document import Document
-from bokeh.model import Model
-from bokeh.models import (
-    BoxAnnotation,
-    ColorBar,
-    ColorMapper,
-    ColumnDataSource,
-    FixedTicker,
-    GlyphRenderer,
-    HoverTool,
-    Label,
-    LayoutDOM,
-    Legend,
-    LegendItem,
-    LinearColorMapper,
-    PanTool,
-    PlainText,
-    Plot,
-    Range1d,
-    WheelZoomTool,
-    glyphs,
-)
-from bokeh.plotting import figure
 
 from fusion.common import own_name
 from fusion.report.charts.embedded import EmbeddedChart, in_script
+from fusion.report.charts.models import Figure, Model, document, field, source
 from fusion.results.numbers import span
 from interferometry.plots import ACCENT, COLOURS, GRID, INK, MUTED
 
@@ -52,12 +27,24 @@ BEFORE = "#76858c"
 MARKERS = {"positive": "triangle", "negative": "inverted_triangle"}
 #: Perceptually uniform scale for quantities, and a diverging one with its middle at zero; both hold for colour-blind readers.
 SEQUENTIAL, DIVERGING = "inferno", "RdBu_r"
-#: Colours of the scales by name, from low to high, as Bokeh brings them.
-_SCALES = {SEQUENTIAL: palettes.Inferno256, DIVERGING: palettes.RdBu11, "PuOr_r": palettes.PuOr11}
-#: Share of the scale of ordered lines that is dark enough to be read on white (contrast of at least 3 : 1).
-_DARK_SHARE = 0.58
+#: Colours of the scales by name, from low to high, in equal steps: inferno of matplotlib; RdBu and PuOr of ColorBrewer.
+_SCALES = {
+    SEQUENTIAL: "000003 0A0723 200C4A 3C0965 570F6D 70196E 892269 A32B61 BB3754 D04544 E35832 F0701E F98C09 FBAA0E F8C931 F1E864 FCFEA4",
+    DIVERGING: "053061 2166ac 4393c3 92c5de d1e5f0 f7f7f7 fddbc7 f4a582 d6604d b2182b 67001f",
+    "PuOr_r": "2d004b 542788 8073ac b2abd2 d8daeb f7f7f7 fee0b6 fdb863 e08214 b35806 7f3b08",
+}
+#: What of matplotlib's viridis is dark enough to be read on white (contrast of at least 3 : 1): lines that have an order.
+_ORDERED = "440154 481A6C 45327F 3E4888 355C8C 2D6E8E 267F8E 20918C 1FA286"
 #: Labels of logarithmic axes: 1, 2 and 5 of every decade.
 _LOG_TICKS = [step * 10.0**decade for decade in range(-6, 7) for step in (1, 2, 5)]
+_DATES = {
+    "minutes": "%H:%M",
+    "hourmin": "%H:%M",
+    "hours": "%H:%M",
+    "days": "%Y-%m-%d",
+    "months": "%Y-%m",
+    "years": "%Y",
+}
 _FONT = "system-ui, Segoe UI, Roboto, Helvetica Neue, DejaVu Sans, sans-serif"
 
 
@@ -67,11 +54,11 @@ Tips: TypeAlias = Sequence[tuple[str, str]]
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart as a page shows it: a Bokeh figure or layout; one sentence that says what is seen, for readers who do not see it; columns of
+    """A chart as a page shows it: a figure, or a column of several; one sentence that says what is seen, for readers who do not see it; columns of
     one length that the reader can download, by heading with unit.
     """
 
-    figure: LayoutDOM
+    figure: Model
     seen: str
     columns: Mapping[str, Sequence[Any] | np.ndarray]
 
@@ -88,49 +75,82 @@ def new_figure(
     y_type: str = "auto",
     legend_columns: int = 2,
     zero: bool = False,
-) -> figure:
+) -> Figure:
     """Return an empty figure in the common style: as wide as its place in the page, legend above the data, on demand the line of zero."""
-    ranges: dict[str, Any] = {"x_range": x_range, "y_range": y_range}
-    drawn = figure(
-        height=height, sizing_mode="stretch_width", tools="", toolbar_location=None, title=title or None,
-        x_axis_label=_announced(x, x_type), y_axis_label=_announced(y, y_type), x_axis_type=x_type, y_axis_type=y_type,
-        background_fill_color="#ffffff", border_fill_color="#ffffff", outline_line_color=None, min_border_right=14,
-        **{name: given for name, given in ranges.items() if given is not None},
+    axes = [_axis(_announced(x, x_type), x_type, x_range), _axis(_announced(y, y_type), y_type, y_range)]
+    heading: dict[str, Any] = {"text_font": _FONT, "text_font_size": "13px", "text_color": INK}
+    legend = Model(
+        "Legend", orientation="horizontal", ncols=legend_columns, border_line_color=None, background_fill_alpha=0.0, margin=0, padding=2,
+        label_text_font=_FONT, label_text_font_size="11px", label_text_color=INK, click_policy="hide", spacing=8, label_height=14, items=[],
     )  # fmt: skip
-    drawn.add_tools(PanTool(), WheelZoomTool())
-    drawn.toolbar.active_drag = drawn.toolbar.active_scroll = None
-    for axis in drawn.axis:
-        axis.update(
-            axis_label_text_font=_FONT, axis_label_text_font_size="12px", axis_label_text_font_style="normal",
-            axis_label_text_color=INK, major_label_text_font=_FONT, major_label_text_font_size="11px",
-            major_label_text_color=INK, axis_line_color=MUTED, major_tick_line_color=MUTED, minor_tick_line_color=None,
-        )  # fmt: skip
-    for axis, scale in ((drawn.xaxis, x_type), (drawn.yaxis, y_type)):
-        if scale == "log":
-            axis.ticker = FixedTicker(ticks=_LOG_TICKS)
-    drawn.grid.grid_line_color = GRID
-    if title:
+    drawn = Figure(
+        "Figure", height=height, sizing_mode="stretch_width", toolbar_location=None, background_fill_color="#ffffff",
+        border_fill_color="#ffffff", outline_line_color=None, min_border_right=14,
         # A name from a file is no formula, which Bokeh would look for between signs such as $$.
-        drawn.title.update(text=PlainText(text=title), text_font=_FONT, text_font_size="13px", text_color=INK)
-    drawn.add_layout(
-        Legend(
-            orientation="horizontal", ncols=legend_columns, border_line_color=None, background_fill_alpha=0.0, margin=0, padding=2,
-            label_text_font=_FONT, label_text_font_size="11px", label_text_color=INK, click_policy="hide", spacing=8, label_height=14,
-        ),
-        "above",
+        title=Model("Title", text=Model("PlainText", text=title), **heading) if title else None,
+        x_range=_range(x_range), y_range=_range(y_range), x_scale=_scale(x_type, x_range), y_scale=_scale(y_type, y_range),
+        below=axes[:1], left=axes[1:], above=[legend], renderers=[],
+        center=[Model("Grid", dimension=at, axis=axis, grid_line_color=GRID) for at, axis in enumerate(axes)],
+        toolbar=Model("Toolbar", tools=[Model("PanTool"), Model("WheelZoomTool")], active_drag=None, active_scroll=None),
     )  # fmt: skip
     if zero:
         draw(drawn, "HSpan", y=0.0, line_color=MUTED, line_width=1, level="underlay")
     return drawn
 
 
+#: Ends of an axis, or its names; None: the range of what is drawn.
+_Ends: TypeAlias = tuple[float, float] | Sequence[str] | None
+
+
+def _is_named(ends: _Ends) -> bool:
+    return ends is not None and isinstance(ends[0], str)
+
+
+def _range(ends: _Ends) -> Model:
+    """Return a range."""
+    if ends is None:
+        return Model("DataRange1d")
+    if _is_named(ends):
+        return Model("FactorRange", factors=list(ends))
+    return Model("Range1d", start=ends[0], end=ends[1])
+
+
+def _scale(kind: str, ends: _Ends) -> Model:
+    """Return what turns values into pixels."""
+    return Model("CategoricalScale" if _is_named(ends) else "LogScale" if kind == "log" else "LinearScale")
+
+
+def _axis(label: str, kind: str, ends: _Ends) -> Model:
+    """Return an axis in the common style."""
+    made = Model(
+        "CategoricalAxis" if _is_named(ends) else {"log": "LogAxis", "datetime": "DatetimeAxis"}.get(kind, "LinearAxis"),
+        axis_label=label, axis_label_text_font=_FONT, axis_label_text_font_size="12px", axis_label_text_font_style="normal",
+        axis_label_text_color=INK, major_label_text_font=_FONT, major_label_text_font_size="11px",
+        major_label_text_color=INK, axis_line_color=MUTED, major_tick_line_color=MUTED, minor_tick_line_color=None,
+    )  # fmt: skip
+    if kind == "log":
+        made.ticker = fixed_ticks(_LOG_TICKS)
+    if kind == "datetime":
+        made.update(
+            formatter=Model("DatetimeTickFormatter", **_DATES), major_label_policy=Model("NoOverlap", min_distance=8)
+        )
+    return made
+
+
+def fixed_ticks(places: Sequence[float]) -> Model:
+    """Return labels at these places of an axis."""
+    return Model("FixedTicker", ticks=list(places))
+
+
 def _announced(label: str, scale: str) -> str:
     return f"{label} (logarithmic)" if scale == "log" else label
 
 
-def add_hover(drawn: figure, tips: Tips, renderers: Sequence[GlyphRenderer]) -> None:
+def add_hover(drawn: Figure, tips: Tips, renderers: Sequence[Model]) -> Model:
     """Show the values under the pointer."""
-    drawn.add_tools(HoverTool(tooltips=list(tips), renderers=list(renderers)))
+    tool = Model("HoverTool", tooltips=list(tips), renderers=list(renderers))
+    drawn.toolbar.tools.append(tool)
+    return tool
 
 
 def literal(name: str) -> str:
@@ -139,27 +159,38 @@ def literal(name: str) -> str:
 
 
 def draw(
-    drawn: figure, kind: str, *, source: Any = None, named: str = "", level: str = "glyph", hovered: Any = None, **looks: Any
-) -> GlyphRenderer:  # fmt: skip
-    """Draw marks of one of Bokeh's kinds, arrays among their looks being columns, and name them in the legend. Bokeh's own methods make
-    each mark three times, for what is selected and what is muted.
-    """
-    columns = {key: given for key, given in looks.items() if isinstance(given, list | np.ndarray)}
-    held = source if isinstance(source, ColumnDataSource) else ColumnDataSource({**(source or {}), **columns})
-    looks, made = looks | {key: key for key in columns}, getattr(glyphs, kind)
-    under = made(**looks | hovered) if hovered else None
-    others: dict[str, Any] = {"level": level, "hover_glyph": under, "nonselection_glyph": None, "muted_glyph": None}
-    mark = drawn.add_glyph(held, made(**looks), **others)
-    items = drawn.legend[0].items
-    if same := [item for item in items if item.label == value(named)]:
+    drawn: Figure, kind: str, *, columns: Model | None = None, named: str = "", level: str = "glyph", hovered: Any = None, **looks: Any
+) -> Model:  # fmt: skip
+    """Draw marks of one of Bokeh's kinds, and name them in the legend; arrays among their looks are columns, which a text may name, too."""
+    own = {key: given for key, given in looks.items() if isinstance(given, list | np.ndarray)}
+    held = source({}) if columns is None else columns
+    held.data.update(own)
+    looks |= dict.fromkeys(own, None)
+
+    def glyph(looks: Mapping[str, Any]) -> Model:
+        fields = {key: key if key in own else given for key, given in looks.items()}
+        told = {
+            key: field(given) if isinstance(given, str) and given in held.data else given
+            for key, given in fields.items()
+        }
+        return Model(kind, **told)
+
+    mark = Model(
+        "GlyphRenderer", data_source=held, glyph=glyph(looks), level=level, hover_glyph=glyph(looks | hovered) if hovered else None,
+        nonselection_glyph=None, muted_glyph=None,
+    )  # fmt: skip
+    drawn.renderers.append(mark)
+    items = drawn.legend.items
+    label = {"type": "value", "value": named}
+    if same := [item for item in items if item.label == label]:
         same[0].renderers.append(mark)
     elif named:
-        items.append(LegendItem(label=value(named), renderers=[mark]))
+        items.append(Model("LegendItem", label=label, renderers=[mark]))
     return mark
 
 
 def add_series(
-    drawn: figure,
+    drawn: Figure,
     x: np.ndarray,
     y: np.ndarray,
     *,
@@ -174,18 +205,18 @@ def add_series(
     legend: bool = True,
 ) -> None:
     """Draw a named series with its values under the pointer; `half` the length (n,) of its error bars to either side, or (2, n) of each."""
-    source = ColumnDataSource({"x": np.asarray(x), "y": np.asarray(y)})
-    common: dict[str, Any] = {"source": source, "named": name if legend else "", "line_color": colour}
+    held = source({"x": np.asarray(x), "y": np.asarray(y)})
+    common: dict[str, Any] = {"columns": held, "named": name if legend else "", "line_color": colour}
     parts = []
     if half is not None:
         below, above = np.broadcast_to(half, (2, len(y)))
-        source.data = {**source.data, "half": above, "low": np.asarray(y) - below, "high": np.asarray(y) + above}
+        held.data.update(half=above, low=np.asarray(y) - below, high=np.asarray(y) + above)
         draw(drawn, "Segment", **common, x0="x", y0="low", x1="x", y1="high", line_width=1.3)
     if line:
         parts.append(draw(drawn, "Line", **common, x="x", y="y", line_dash=dash, line_width=width))
     if marker is not None:
-        parts.append(draw(drawn, "Scatter", **common, x="x", y="y", marker=value(marker), size=size, fill_color=colour))
-    (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
+        parts.append(draw(drawn, "Scatter", **common, x="x", y="y", marker=marker, size=size, fill_color=colour))
+    (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis, drawn.yaxis))
     bars_shown = "" if half is None else " ± @half{0.000}" if np.ndim(half) == 1 else " (@low{0.000} to @high{0.000})"
     tips = [
         ("", literal(name)),
@@ -198,7 +229,7 @@ def add_series(
 class Courses:
     """Named series of one figure as they are drawn: what the reader can download of them, and what is seen of each, in words."""
 
-    def __init__(self, drawn: figure, columns: Mapping[str, np.ndarray] | None = None, *, unit: str = "µm") -> None:
+    def __init__(self, drawn: Figure, columns: Mapping[str, np.ndarray] | None = None, *, unit: str = "µm") -> None:
         self.figure, self.columns, self.told, self.unit = drawn, dict(columns or {}), list[str](), unit
 
     def add(
@@ -232,7 +263,7 @@ def of_rank(rank: int) -> dict[str, Any]:
 
 
 def add_label(
-    drawn: figure,
+    drawn: Figure,
     x: float,
     y: float,
     text: str,
@@ -244,11 +275,8 @@ def add_label(
 ) -> None:
     """Write a text at a point, moved by an offset in px."""
     across, up = offset
-    drawn.add_layout(
-        Label(
-            x=x, y=y, text=text, text_color=colour, text_font_size=size, text_align=align, x_offset=across, y_offset=up
-        )
-    )
+    looks = {"text_color": colour, "text_font_size": size, "text_align": align}
+    drawn.add(Model("Label", x=x, y=y, text=text, x_offset=across, y_offset=up, **looks))
 
 
 def _parts(label: str) -> tuple[str, str]:
@@ -258,26 +286,33 @@ def _parts(label: str) -> tuple[str, str]:
 
 
 def add_ordered_lines(
-    drawn: figure, xs: Sequence[np.ndarray], ys: Sequence[np.ndarray], order: np.ndarray, label: str
+    drawn: Figure, xs: Sequence[np.ndarray], ys: Sequence[np.ndarray], order: np.ndarray, label: str
 ) -> None:
     """Draw one line for each value of an ordered quantity, such as a cycle, with colour bar and values under the pointer."""
-    (along, x_unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
-    source = {"xs": list(xs), "ys": list(ys), "order": np.asarray(order, float), "colour": ordered_colours(len(order))}
+    (along, x_unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis, drawn.yaxis))
+    held = source(
+        {"xs": list(xs), "ys": list(ys), "order": np.asarray(order, float), "colour": ordered_colours(len(order))}
+    )
     looks: dict[str, Any] = {"xs": "xs", "ys": "ys", "line_color": "colour", "line_width": 1.4}
-    lines = draw(drawn, "MultiLine", source=source, hovered={"line_width": 3.5}, **looks)
+    lines = draw(drawn, "MultiLine", columns=held, hovered={"line_width": 3.5}, **looks)
     name, unit = _parts(label)
     tips = [(name, f"@order{{0.[000]}} {unit}"), (along, f"$x{{0.[00]}} {x_unit}"), (quantity, f"$y{{0.00}} {y_unit}")]
     add_hover(drawn, tips, [lines])
     low, high = float(np.min(order)), float(np.max(order))
-    add_colour_bar(drawn, LinearColorMapper(ordered_colours(256), low=low, high=high if high > low else low + 1), label)
+    add_colour_bar(drawn, mapper(ordered_colours(256), low, high if high > low else low + 1), label)
 
 
-def add_hold_out(drawn: figure, low: float, high: float) -> None:
+def add_hold_out(drawn: Figure, low: float, high: float) -> None:
     """Shade the part of a test that took no part in any choice."""
-    drawn.add_layout(BoxAnnotation(left=low, right=high, fill_color=ACCENT, fill_alpha=0.08, level="underlay"))
+    shade(drawn, low, high, 0.08)
 
 
-def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str, name: str = "") -> None:
+def shade(drawn: Figure, low: float, high: float | None, alpha: float) -> None:
+    """Shade what lies between two places of the horizontal axis, or from one on."""
+    drawn.add(Model("BoxAnnotation", left=low, right=high, fill_color=ACCENT, fill_alpha=alpha, level="underlay"))
+
+
+def add_band(drawn: Figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str, name: str = "") -> None:
     """Shade what lies between two lines; a gap in either is a gap."""
     x, low, high = (np.asarray(values, float) for values in (x, low, high))
     valid = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
@@ -287,29 +322,44 @@ def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, co
             draw(drawn, "VArea", **ends, fill_color=colour, fill_alpha=0.18, named=name, level="underlay")
 
 
-def add_colour_bar(
-    drawn: figure, mapper: ColorMapper, label: str, *, ticks: Sequence[float] | None = None, place: str = "below"
-) -> None:
+def mapper(colours: Sequence[str], low: float, high: float, **beyond: str) -> Model:
+    """Return what gives values their colours; `beyond` those of values outside and of none."""
+    return Model("LinearColorMapper", palette=list(colours), low=low, high=high, **beyond)
+
+
+#: Looks of a scale of colours.
+COLOUR_BAR: dict[str, Any] = {
+    "title_text_font": _FONT, "title_text_font_size": "11px", "title_text_font_style": "normal", "title_text_color": INK,
+    "major_label_text_font": _FONT, "major_label_text_font_size": "11px", "major_label_text_color": INK, "bar_line_color": None,
+    "major_tick_line_color": MUTED, "background_fill_color": None, "padding": 4,
+}  # fmt: skip
+
+
+def add_colour_bar(drawn: Figure, colours: Model, label: str, *, place: str = "below") -> Model:
     """Put the scale of the colours at a map or ordered lines."""
-    bar = ColorBar(
-        color_mapper=mapper, title=label, width="auto" if place == "below" else 10, height=10 if place == "below" else "auto",
-        title_text_font=_FONT, title_text_font_size="11px", title_text_font_style="normal", title_text_color=INK,
-        major_label_text_font=_FONT, major_label_text_font_size="11px", major_label_text_color=INK, bar_line_color=None,
-        major_tick_line_color=MUTED, background_fill_color=None, padding=4,
-        **({} if ticks is None else {"ticker": FixedTicker(ticks=list(ticks))}),
-    )  # fmt: skip
-    drawn.add_layout(bar, place)
+    length, breadth = ("width", "height") if place == "below" else ("height", "width")
+    bar = Model("ColorBar", color_mapper=colours, title=label, **{length: "auto", breadth: 10}, **COLOUR_BAR)
+    drawn.add(bar, place)
+    return bar
 
 
 def palette(name: str = SEQUENTIAL) -> list[str]:
     """Return the colours of a scale from low to high."""
-    return list(palettes.interp_palette(_SCALES[name], 256))
+    return list(_steps(_SCALES[name], 256))
 
 
 def ordered_colours(count: int) -> list[str]:
     """Return the colours of lines that have an order, such as cycles or positions, from dark to lighter."""
-    dark = palettes.Viridis256[: round(_DARK_SHARE * 256)]
-    return list(palettes.interp_palette(dark, count))
+    return list(_steps(_ORDERED, count))
+
+
+@cache
+def _steps(colours: str, count: int) -> tuple[str, ...]:
+    """Return colours between those of a scale in equal steps."""
+    known = np.array([list(bytes.fromhex(colour)) for colour in colours.split()], float)
+    at = np.linspace(0, len(known) - 1, count)
+    mixed = np.stack([np.interp(at, np.arange(len(known)), part) for part in known.T], axis=1).astype(np.uint8)
+    return tuple(f"#{bytes(colour).hex()}" for colour in mixed)
 
 
 def shared_range(*values: np.ndarray, symmetrical: bool = False) -> tuple[float, float]:
@@ -324,9 +374,9 @@ def shared_range(*values: np.ndarray, symmetrical: bool = False) -> tuple[float,
     return low - margin, high + margin
 
 
-def fix_range(drawn: figure, low: float, high: float) -> None:
+def fix_range(drawn: Figure, low: float, high: float) -> None:
     """Set the y range of a chart."""
-    drawn.y_range = Range1d(low, high)
+    drawn.y_range = _range((low, high))
 
 
 def span_words(values: np.ndarray | xr.DataArray, unit: str) -> str:
@@ -342,42 +392,23 @@ def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
     for chart in charts.values():
         _prepare(chart)
     return {
-        name: EmbeddedChart(name, chart.seen, _height(chart), in_script(json.dumps(item, separators=(",", ":")), "</"))
-        for (name, chart), item in zip(charts.items(), _items(charts), strict=True)
+        name: EmbeddedChart(
+            name, chart.seen, _height(chart), in_script(json.dumps(_item(name, chart), separators=(",", ":")), "</")
+        )
+        for name, chart in charts.items()
     }
 
 
 def _prepare(chart: Chart) -> None:
     """Add to a chart what it lets the reader download."""
     columns = {heading: _compact(np.asarray(values)) for heading, values in chart.columns.items()}
-    chart.figure.tags = [ColumnDataSource(columns), *chart.figure.tags]
+    chart.figure.tags = [source(columns), *chart.figure.properties.get("tags", [])]
 
 
-def _items(charts: Mapping[str, Chart]) -> list[dict[str, object]]:
-    """Return what `bokeh.embed.json_item` returns of every chart; it also looks for mistakes in every drawing, for most of the time."""
-    empty = Document(title="").to_json(deferred=False)
-    items: list[dict[str, object]] = []
-    for name, chart in charts.items():
-        names = {"target_id": f"drawing-{name}", "root_id": chart.figure.id}
-        drawing = _Sparing(deferred=False).encode(chart.figure)
-        items.append({**names, "doc": {**empty, "roots": [drawing]}, "version": bokeh.__version__})
-    return items
-
-
-class _Sparing(Serializer):
-    """Writes models as Bokeh does, which also makes the default of every property that it then leaves out, for most of the time."""
-
-    def _encode(self, obj: Any) -> Any:
-        if not isinstance(obj, Model):
-            return super()._encode(obj)
-        self.add_ref(obj, obj.ref)
-        known = obj._property_values.keys() | obj._unstable_default_values.keys()
-        values = obj.query_properties_with_values(
-            lambda one: one.serialized and one.name in known, include_defaults=False
-        )
-        attributes = {key: self.encode(value) for key, value in values.items()}
-        written = {"type": "object", "name": obj.__qualified_model__, "id": obj.id}
-        return {**written, "attributes": attributes} if attributes else written
+def _item(name: str, chart: Chart) -> dict[str, object]:
+    """Return a chart as BokehJS embeds it, its document of one root."""
+    doc = document(chart.figure)
+    return {"target_id": f"drawing-{name}", "root_id": doc["roots"][0]["id"], "doc": doc}
 
 
 def _compact(values: np.ndarray) -> np.ndarray:
@@ -387,12 +418,12 @@ def _compact(values: np.ndarray) -> np.ndarray:
     return values.astype(str).astype(object)
 
 
-def _plots(chart: Chart) -> list[Plot]:
-    """Return the figure of a chart, or those of a layout."""
-    return [chart.figure] if isinstance(chart.figure, Plot) else list(chart.figure.select({"type": Plot}))
-
-
 def _height(chart: Chart) -> int:
     """Return the height of a chart in CSS px: its own, or the sum of what a column of charts holds."""
-    own = chart.figure.height
-    return int(own) if own is not None else sum(int(plot.height or 0) for plot in _plots(chart))
+    plots = chart.figure.properties.get("children", [chart.figure])
+    return sum(int(plot.height) for plot in plots)
+
+
+def column(parts: Sequence[Figure]) -> Model:
+    """Return figures one below another, as wide as the page."""
+    return Model("Column", children=list(parts), sizing_mode="stretch_width")

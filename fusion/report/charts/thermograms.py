@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from bokeh.plotting import figure
 
 from fusion.common import own_name
+from fusion.report.charts.models import Figure
 from fusion.report.charts.plan import add_marks, add_names, draw_both, draw_picture
 from fusion.report.charts.style import DIVERGING, Chart, Courses, add_series, draw, new_figure, of_rank, span_words
 from fusion.results.numbers import fixed
@@ -74,7 +74,7 @@ def plot_thermogram(thermograms: xr.Dataset) -> Chart:
     return Chart(drawn, seen, _columns(values, "temperature / °C"))
 
 
-def _draw(values: np.ndarray, low: float, high: float, label: str, **looks: Any) -> figure:
+def _draw(values: np.ndarray, low: float, high: float, label: str, **looks: Any) -> Figure:
     """Draw a picture of any size with its places in pixels of the sensor."""
     means, block = _averaged(values, _DRAWN)
     return draw_picture(means, low, high, label, block=block, **looks)
@@ -95,7 +95,7 @@ def _columns(values: np.ndarray, label: str) -> dict[str, np.ndarray]:
     return {"column / px": column.ravel(), "row / px": row.ravel(), label: means.ravel()}
 
 
-def _draw_outline(drawn: figure, outline: dict[str, Any]) -> None:
+def _draw_outline(drawn: Figure, outline: dict[str, Any]) -> None:
     """Draw a region with its name."""
     points = np.array(outline["points"], float)
     (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)

@@ -55,6 +55,7 @@
     if (view.model.name !== "plan") return;
     figure.classList.add("plan");
     if (!view.frame.bbox.width) return;
+    for (const part of view.model.renderers) if (part.name === "aside") part.visible = view.frame.bbox.width > 400;
     const { x_range, y_range } = view.model, ratio = Math.abs((y_range.end - y_range.start) / (x_range.end - x_range.start));
     view.model.frame_height = Math.round(Math.min(tallest, view.frame.bbox.width * ratio));
     view.model.height = null;

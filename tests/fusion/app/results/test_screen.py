@@ -99,7 +99,7 @@ def test_places_are_added_by_keyboard_and_by_click(page):
 def test_the_report_stands_first_and_says_what_was_found(page):
     opened(page, "Report")
     report = page.frame_locator("iframe[title=Report]")
-    report.locator("#summary .headline").first.wait_for()
+    report.locator("#summary .answers").wait_for()
     report.get_by_role("heading", name="Next").wait_for()
     page.wait_for_function("document.documentElement.scrollWidth <= 390")
 

@@ -7,6 +7,13 @@ import xarray as xr
 from fusion.results.store import read_dataset, read_grouped, read_tree
 
 
+def parts_of(drawn, kind):
+    """The parts of a figure that are no marks, of one kind."""
+    return [
+        one for place in ("center", "below", "right") for one in drawn.properties.get(place, ()) if one.kind == kind
+    ]
+
+
 @pytest.fixture(scope="session")
 def deviations(results_folder):
     return read_grouped(results_folder / "deviations.nc")

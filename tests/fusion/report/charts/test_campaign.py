@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from bokeh.models import BoxAnnotation, ColorBar, LinearColorMapper
+from bokeh.models import GlyphRenderer
+from bokeh.palettes import Inferno256, Viridis256
 
+from fusion.app.drawings import figure_of
+from fusion.report.charts import campaign as campaign_charts
 from fusion.report.charts import model as model_charts
 from fusion.report.charts import record as record_charts
 from fusion.report.charts import style
@@ -20,6 +23,7 @@ from fusion.results.numbers import alike, number
 from fusion.results.results import read_results
 from fusion.results.store import group, read_fusion, read_product
 from tests.browser import CHROMIUM, record_faults
+from tests.fusion.report.charts.conftest import parts_of
 
 
 def contrast_with_white(colour: str) -> float:
@@ -40,17 +44,14 @@ def test_a_chart_lets_the_page_scroll_and_names_axes_bands_and_colours():
     assert drawn.toolbar.active_drag is None
     assert (drawn.xaxis.axis_label, drawn.yaxis.axis_label) == ("position / mm", "power (logarithmic)")
     assert drawn.sizing_mode == "stretch_width"
-    assert drawn.legend[0] in drawn.above
+    assert drawn.legend in drawn.above
     drawn = style.new_figure(x="x", y="y")
     low = np.array([0.0, 1.0, np.nan, 3.0, 4.0])
     style.add_band(drawn, np.arange(5.0), low, low + 1, "#000000")
     pieces = [renderer.data_source.data["x"].tolist() for renderer in drawn.renderers]
     assert pieces == [[0.0, 1.0], [3.0, 4.0]]
     drawn = style.new_figure(x="x", y="y")
-    style.add_colour_bar(drawn, LinearColorMapper(style.palette(), low=0, high=1), "rise / K", ticks=[0, 0.5, 1])
-    (bar,) = drawn.select(ColorBar)
-    assert bar.title == "rise / K"
-    assert list(bar.ticker.ticks) == [0, 0.5, 1]
+    assert style.add_colour_bar(drawn, style.mapper(style.palette(), 0.0, 1.0), "rise / K").title == "rise / K"
     low, high = style.shared_range(np.array([-1.0, np.nan]), np.array([3.0]))
     assert (low, high) == pytest.approx((-1.16, 3.16))
     assert style.shared_range(np.array([-1.0, 3.0]), symmetrical=True) == pytest.approx((-3.24, 3.24))
@@ -61,9 +62,28 @@ def test_a_chart_lets_the_page_scroll_and_names_axes_bands_and_colours():
 
 def small_chart() -> Chart:
     drawn = new_figure(x="position / mm", y="drift / µm", height=200)
-    drawn.line([0.0, 10.0], [1.5, -2.0])
+    style.draw(drawn, "Line", x=[0.0, 10.0], y=[1.5, -2.0])
     columns = {"position / mm": np.array([0.0, 10.0]), "name": ["=1+1", "a, b"], "drift / µm": [1.5, np.nan]}
     return Chart(drawn, 'Falls from 1.5 to −2.0 µm over "10" mm.', columns)
+
+
+def test_every_chart_is_one_that_the_library_reads(results_folder, deviations, fused, fields, monkeypatch):
+    drawn = {}
+    monkeypatch.setattr(campaign_charts, "embed", lambda charts: drawn.update(charts) or {})
+    datasets = {"deviations": deviations, "fusion": read_fusion(results_folder), "fields": fields}
+    draw_campaign(read_results(results_folder), datasets)
+    assert len(drawn) > 20
+    for chart in drawn.values():
+        # Names and kinds of all properties are checked.
+        assert list(figure_of(chart.figure).select({"type": GlyphRenderer}))
+
+
+def test_colours_between_those_of_a_scale_are_the_scale_of_matplotlib():
+    for scale, shown in ((Inferno256, style.palette()), (Viridis256[:148], style.ordered_colours(148))):
+        apart = [
+            np.subtract(*(list(bytes.fromhex(one[1:])) for one in pair)) for pair in zip(scale, shown, strict=True)
+        ]
+        assert np.abs(apart).max() <= 6  # of 255: straight lines between 17 and 9 of 256 colours
 
 
 def test_an_embedded_chart_carries_its_document_and_its_columns():
@@ -230,7 +250,7 @@ def record():
 def test_prediction_residuals_and_contributions_of_a_record(record):
     chart = record_charts.plot_prediction(record, "X")
     np.testing.assert_array_equal(chart.columns["measured / µm"], record["displacement"].sel(channel="X"))
-    (shade,) = chart.figure.select(BoxAnnotation)
+    (shade,) = parts_of(chart.figure, "BoxAnnotation")
     assert (shade.left, shade.right) == (8.0, 9.0)
     band = record_charts.plot_prediction(record, "X").columns["95 % band ± / µm"]
     missed = (record["displacement"] - record["predicted_final"]).values[:8]
@@ -244,7 +264,7 @@ def test_prediction_residuals_and_contributions_of_a_record(record):
 
 def test_temperatures_drivers_and_held_out_runs_of_a_record(record):
     chart = record_charts.plot_temperatures(record)
-    names = [item.label.value for item in chart.figure.legend[0].items]
+    names = [item.label["value"] for item in chart.figure.legend.items]
     assert names == ["other sensors", "t5", "t4", "t3", "t2"]
     assert "those that move most are t5, t4, t3 and t2" in chart.seen
     chart = record_charts.plot_drivers(record)
@@ -255,7 +275,7 @@ def test_temperatures_drivers_and_held_out_runs_of_a_record(record):
     assert len(both.figure.children) == 2
     runs = record.assign(run=("time", [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]), elapsed=("time", np.arange(10) * 3600.0))
     runs["sealed"] = ("time", np.isin(runs["run"], [2, 5]))
-    shades = list(record_charts.plot_residuals(runs, "X").figure.select(BoxAnnotation))
+    shades = list(parts_of(record_charts.plot_residuals(runs, "X").figure, "BoxAnnotation"))
     assert sorted((shade.left, shade.right) for shade in shades) == [(2.0, 3.0), (8.0, 9.0)]
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import xarray as xr
-from bokeh.models import Arrow
 
 from fusion.report.charts import model as attribution
 from fusion.report.charts import plan
@@ -14,6 +13,7 @@ from fusion.report.charts.style import Chart
 from fusion.results.axis import HotspotPart
 from fusion.results.parts import AreaPart
 from fusion.results.store import group
+from tests.fusion.report.charts.conftest import parts_of
 
 
 def test_the_frame_lies_under_its_fiducials(fields):
@@ -36,7 +36,7 @@ def test_a_cycle_without_a_field_is_a_gap(fields):
 
 def test_the_contact_sheet_spreads_cycles_over_the_test_on_one_scale(fields):
     chart = plan.plot_contact_sheet(fields)
-    (maps,) = [one for one in chart.figure.renderers if type(one.glyph).__name__ == "Image"]
+    (maps,) = [one for one in chart.figure.renderers if one.glyph.kind == "Image"]
     data, cycles = maps.data_source.data, fields["cycle"].values
     names = [f"cycle {cycles[0]}", f"cycle {cycles[-1]}"]
     assert [data["cycle"][0], data["cycle"][-1]] == names and len(data["cycle"]) == min(12, cycles.size)
@@ -66,7 +66,7 @@ def test_cells_lie_where_their_middles_are(plan_of_cells):
 
 
 def picture(chart: attribution.Chart) -> np.ndarray:
-    (cells,) = [r for r in chart.figure.renderers if type(r.glyph).__name__ == "Image"]
+    (cells,) = [r for r in chart.figure.renderers if r.glyph.kind == "Image"]
     return cells.data_source.data["image"][0]
 
 
@@ -77,7 +77,7 @@ def test_significance_has_four_steps_and_sensitivity_is_blank_without_it(plan_of
     assert chart.figure.title.text.text == "drift common to all positions"
     chart = attribution.plot_sensitivity(plan_of_cells, "common")
     np.testing.assert_allclose(picture(chart), [[0.5, 3.0, np.nan], [np.nan] * 3])
-    assert chart.figure.legend[0].items[0].label.value == "not significant (p > 0.05)"
+    assert chart.figure.legend.items[0].label["value"] == "not significant (p > 0.05)"
     assert "sensitivity 0.50 to 3.00 µm/K" in chart.seen
     assert chart.columns["sensitivity / (µm/K)"].size == 6
     none = plan_of_cells.assign(p_value=plan_of_cells["p_value"] * 0 + 0.4)
@@ -116,7 +116,7 @@ def sensors() -> xr.Dataset:
 
 def test_sound_and_faulty_parts_and_the_camera_are_told_apart():
     chart = plot_sensors(sensors())
-    named = [item.label.value for item in chart.figure.legend[0].items]
+    named = [item.label["value"] for item in chart.figure.legend.items]
     assert named == ["t1", "camera at t1", "t2", "t2 after its fault (not used)"]
     assert "0 to 4 K" in chart.seen.replace("0.00", "0").replace("4.00", "4")
     assert set(chart.columns["source"]) == {"contact sensor", "camera"}
@@ -198,18 +198,16 @@ def test_line_and_hotspots_are_drawn_whole(fields):
     position = xr.DataArray(np.arange(6)[::-1] * 50.0, dims="target", coords={"target": fields["target"].values})
     chart, _ = thermal_map.plot_thermal_map(fields, [spot], position)
     assert chart.figure.x_range.end > edge + 10
-    line = next(one for one in chart.figure.renderers if type(one.glyph).__name__ == "Line").data_source.data["x"]
+    line = next(one for one in chart.figure.renderers if one.glyph.kind == "Line").data_source.data["x"]
     np.testing.assert_array_equal(line, fields["target_x"].values[::-1])
-    (arrow,) = chart.figure.select(Arrow)
+    (arrow,) = parts_of(chart.figure, "Arrow")
     assert np.sign(arrow.x_end - arrow.x_start) == np.sign(line[-1] - line[-2])
     assert "1 hotspots are ringed" not in chart.seen and "1 hotspot is ringed" in chart.seen
     assert f"in cycle {int(fields['cycle'][-1])} the rise is" in chart.seen
     ended = spot.model_copy(update={"onset_cycle": 2, "end_cycle": 3})
     chart, _ = thermal_map.plot_thermal_map(fields, [ended], position)
     assert "1 of which ended" in chart.seen
-    texts = [
-        one.data_source.data.get("text", ()) for one in chart.figure.renderers if type(one.glyph).__name__ == "Text"
-    ]
+    texts = [one.data_source.data.get("text", ()) for one in chart.figure.renderers if one.glyph.kind == "Text"]
     assert any("hotspot 1 (cycle 2 to 3)" in names for names in texts)
 
 
@@ -217,7 +215,7 @@ def test_a_target_that_stands_out_is_ringed_where_it_is(fields):
     plain, _ = thermal_map.plot_thermal_map(fields)
     chart, _ = thermal_map.plot_thermal_map(fields, standing_out={3, 99})
     added = chart.figure.renderers[len(plain.figure.renderers) :]
-    marks = [one.data_source.data for one in added if type(one.glyph).__name__ == "Scatter"]
+    marks = [one.data_source.data for one in added if one.glyph.kind == "Scatter"]
     (rings,) = {(float(data["x"][0]), float(data["y"][0])) for data in marks}
     target = fields.sel(target=3)
     assert rings == (float(target["target_x"]), float(target["target_y"]))
@@ -239,7 +237,7 @@ def test_a_long_recording_is_thinned_and_says_so(fields, monkeypatch):
 def test_a_recording_without_readings_has_a_map_without_a_line(fields):
     alone = fields.drop_vars(["target", "target_x", "target_y"])
     chart, found = thermal_map.plot_thermal_map(alone)
-    assert found.quantities and not chart.figure.select(type=Arrow)
+    assert found.quantities and not parts_of(chart.figure, "Arrow")
 
 
 def test_a_place_of_the_plan_is_drawn_where_the_frame_shows_it(fields):
@@ -251,8 +249,6 @@ def test_a_place_of_the_plan_is_drawn_where_the_frame_shows_it(fields):
     area = AreaPart(x_low_mm=100.0, x_high_mm=200.0, y_low_mm=40.0, y_high_mm=90.0)
     x, y = plan._rim(area)
     assert (x[0], y[0]) == (x[-1], y[-1]) == (100.0, 40.0) and {x.max(), y.max()} == {200.0, 90.0}
-    lines = [
-        one for one in plan.plot_registration(fields, (), area).figure.renderers if type(one.glyph).__name__ == "Line"
-    ]
+    lines = [one for one in plan.plot_registration(fields, (), area).figure.renderers if one.glyph.kind == "Line"]
     drawn = lines[-1].data_source.data
     assert drawn["x"].size == 81 and 0 < drawn["x"].min() < drawn["x"].max() < fields.sizes["column"]

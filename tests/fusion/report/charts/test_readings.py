@@ -5,7 +5,6 @@ import html
 import numpy as np
 import pytest
 import xarray as xr
-from bokeh.models import BoxAnnotation, Label
 
 from fusion.report.charts import readings as neighbours
 from fusion.report.charts.readings import (
@@ -22,6 +21,7 @@ from fusion.report.charts.style import Courses, literal, new_figure
 from fusion.results.numbers import number
 from fusion.results.store import group
 from interferometry.iso230 import evaluate_iso230
+from tests.fusion.report.charts.conftest import parts_of
 from tests.interferometry.iso230.made_tests import by_hand, test_made
 
 
@@ -85,7 +85,7 @@ def test_reversal_and_scatter_of_a_campaign(deviations):
     np.testing.assert_array_equal(chart.columns["reversal / µm"], drift["reversal"])
     assert chart.figure.yaxis.axis_label == "positive − negative / µm"
     chart = plot_position_scatter(drift, position, {2, 5})
-    shades = sorted(shade.left for shade in chart.figure.select(BoxAnnotation))
+    shades = sorted(shade.left for shade in parts_of(chart.figure, "BoxAnnotation"))
     assert shades == [30.0, 180.0]
     assert chart.seen.endswith("marked as standing out: 50 mm and 200 mm.")
     assert plot_position_scatter(drift, position, set()).seen.endswith("none is marked as standing out.")
@@ -118,7 +118,7 @@ def test_windows_beside_the_whole_test(deviations):
     chart = plot_windows(windows)
     np.testing.assert_array_equal(chart.columns["A / µm"], windows["A"][:-1])
     np.testing.assert_allclose(chart.columns["U(R), k = 2 / µm"], 2 * windows["R_u"][:-1])
-    whole = [r.glyph.y for r in chart.figure.renderers if type(r.glyph).__name__ == "HSpan"]
+    whole = [r.glyph.y for r in chart.figure.renderers if r.glyph.kind == "HSpan"]
     assert whole == pytest.approx([float(windows[name][-1]) for name in "ARB"])
     assert chart.figure.y_range.start == 0.0
 
@@ -154,7 +154,7 @@ def test_means_and_spans_are_those_of_the_readings():
     np.testing.assert_allclose(chart.columns["mean, positive approach / \u00b5m"], x[:, 0].mean(axis=0))
     np.testing.assert_allclose(chart.columns["s, negative approach / \u00b5m"], x[:, 1].std(axis=0, ddof=1))
     true = by_hand(x)
-    texts = {label.text for label in chart.figure.select({"type": Label})}
+    texts = {label.text for label in parts_of(chart.figure, "Label")}
     assert texts == {f"{symbol} {number(true[symbol])}" for symbol in "AEB"}
     assert chart.seen.startswith("Mean deviation over 0.00 to 50.00 mm of the axis with \u00b12 s: positive approach ")
 
@@ -165,7 +165,7 @@ def test_one_approach_has_a_chart_without_b():
     test = test_made(x)
     chart = plot_test(evaluate_iso230(test), test["position"])
     assert "mean, negative approach / \u00b5m" not in chart.columns
-    assert not any(label.text.startswith("B") for label in chart.figure.select({"type": Label}))
+    assert not any(label.text.startswith("B") for label in parts_of(chart.figure, "Label"))
 
 
 def test_one_cycle_of_a_rotary_axis_has_its_readings_and_units():
@@ -173,14 +173,14 @@ def test_one_cycle_of_a_rotary_axis_has_its_readings_and_units():
     test["deviation"].attrs["units"], test["position"].attrs["units"] = "arcsec", "deg"
     chart = plot_test(evaluate_iso230(test), test["position"])
     assert chart.columns["mean, negative approach / arcsec"] == pytest.approx(np.arange(6.0, 12.0))
-    assert {label.text for label in chart.figure.select({"type": Label})} == {"E 11.0", "B 6.00"}
+    assert {label.text for label in parts_of(chart.figure, "Label")} == {"E 11.0", "B 6.00"}
     assert "0.00 to 50.00 deg" in chart.seen and "µm" not in chart.seen
 
 
 def test_the_labels_of_both_spans_stand_apart():
     test = test_made(np.random.default_rng(5).normal(0, 0.1, (5, 2, 6)) + 3.0 * np.arange(6))
     chart = plot_test(evaluate_iso230(test), test["position"])
-    labels = {label.text[0]: label for label in chart.figure.select({"type": Label})}
+    labels = {label.text[0]: label for label in parts_of(chart.figure, "Label")}
     # Text of 12 px is a fifteenth of the chart's height.
     assert labels["E"].y - labels["A"].y > 15.0 / 15
     assert labels["A"].x < labels["E"].x
