@@ -423,7 +423,7 @@ def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: Figure
     words = _words(values)
     drawn = new_figure(x=_TIME, y=unit, title=words, height=118)
     drawn.x_range = above.x_range
-    drawn.yaxis.ticker = Model("BasicTicker", desired_num_ticks=3)
+    drawn.yaxis.ticker = Model("BasicTicker", desired_num_ticks=2)
     low, high = shared_range(values.values)
     fix_range(drawn, low, high)
     line = draw(drawn, "Line", x=hours, y=values.values, line_color=CATEGORIES[at % len(CATEGORIES)], line_width=1.7)

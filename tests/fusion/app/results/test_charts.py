@@ -64,7 +64,7 @@ def test_the_area_that_the_drift_follows_is_drawn_on_the_map(results_folder):
         view = ThermalView(products, selection)
         drawn = view.view.select(pn.pane.Bokeh)[0].object
         texts = [one for one in drawn.renderers if isinstance(one.glyph, Text)]
-        return {word for one in texts for word in np.ravel(one.data_source.data.get(one.glyph.text, one.glyph.text))}
+        return {word for one in texts for word in np.ravel(one.data_source.data["text"])}
 
     assert "the drift follows this" in written("attributable")
     assert "the drift follows this" not in written("not attributable")
