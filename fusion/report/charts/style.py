@@ -54,8 +54,8 @@ Tips: TypeAlias = Sequence[tuple[str, str]]
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart as a page shows it: a figure, or a column of several; one sentence that says what is seen, for readers who do not see it; columns of
-    one length that the reader can download, by heading with unit.
+    """A chart as a page shows it: a figure or a column of several; one sentence that says what is seen, for readers who do not see it;
+    columns of one length that the reader can download, by heading with unit.
     """
 
     figure: Model
