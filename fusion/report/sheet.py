@@ -197,7 +197,7 @@ def render_iso230(sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remark
 
 def _label(chart: Chart, tell: Translate) -> None:
     """Name the axes of a chart in a language."""
-    for axis in (*chart.figure.xaxis, *chart.figure.yaxis):
+    for axis in (chart.figure.below[0], chart.figure.left[0]):
         axis.axis_label = tell(axis.axis_label)
 
 

@@ -198,7 +198,7 @@ def test_more_tests_are_a_trend_with_short_names_and_room_for_them(pairs):
     tests = [pairs[0].before] * 6
     names = [f"{letter}, 2026-03-09" for letter in "ABCDEF"]
     few, many = plot_profiles(tests[:2], names[:2]).figure, plot_profiles(tests, names).figure
-    assert many.legend[0].ncols == 2
+    assert many.legend.ncols == 2
     assert many.height - few.height == pytest.approx(2 * 28)
     assert short_names(pairs) == ["A", "B", "C"]
     assert {len(row.cells) for row in changes_of_all(pairs).rows} == {3}
