@@ -261,7 +261,7 @@ def plot_reference_chart(chart: xr.Dataset, position: xr.DataArray) -> Chart:
     columns: dict[str, np.ndarray] = {"position / mm": place}
     for direction in chart["direction"].values:
         value, border = (chart[name].sel(direction=direction).values for name in ("chart", "border_s"))
-        name, looks = ARROWS[direction], {"line_color": COLOURS[direction], "line_dash": "dashed"}
+        name, looks = ARROWS[direction], dict[str, Any](line_color=COLOURS[direction], line_dash="dashed")
         add_series(drawn, place, value, name=name, **of_direction(direction))
         for sign in (-1, 1):
             draw(drawn, "Line", x=place, y=value + sign * border, named=f"±2 s, {direction}", **looks)
@@ -410,9 +410,16 @@ def _plot_spans(spans: dict[str, list[tuple[float, float]]]) -> Figure:
     drawn = new_figure(x=_TIME, y="", height=60 + 22 * len(names), y_range=names[::-1], x_range=(low, high))
     for at, name in enumerate(names):
         parts = spans[name]
-        ends = {"left": [part[0] for part in parts], "right": [part[1] for part in parts]}
-        colours = {"line_color": CATEGORIES[at], "fill_color": CATEGORIES[at]}
-        bar = draw(drawn, "HBar", y=[name] * len(parts), **ends, height=0.55, **colours)
+        ends: dict[str, Any] = {"left": [part[0] for part in parts], "right": [part[1] for part in parts]}
+        bar = draw(
+            drawn,
+            "HBar",
+            y=[name] * len(parts),
+            **ends,
+            height=0.55,
+            line_color=CATEGORIES[at],
+            fill_color=CATEGORIES[at],
+        )
         add_hover(drawn, [("", name), ("from", "@left{0.00} h"), ("to", "@right{0.00} h")], [bar])
     return drawn
 

@@ -318,8 +318,8 @@ def add_band(drawn: Figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, co
     valid = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
     for piece in np.split(np.arange(x.size), np.flatnonzero(np.diff(valid.astype(int))) + 1):
         if piece.size and valid[piece[0]]:
-            ends = {"x": x[piece], "y1": low[piece], "y2": high[piece]}
-            draw(drawn, "VArea", **ends, fill_color=colour, fill_alpha=0.18, named=name, level="underlay")
+            looks: dict[str, Any] = {"fill_color": colour, "fill_alpha": 0.18, "level": "underlay"}
+            draw(drawn, "VArea", named=name, x=x[piece], y1=low[piece], y2=high[piece], **looks)
 
 
 def mapper(colours: Sequence[str], low: float, high: float, **beyond: str) -> Model:
