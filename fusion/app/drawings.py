@@ -8,6 +8,7 @@ import panel as pn
 from bokeh.document import Document
 from bokeh.models import Range1d
 from bokeh.plotting import figure
+from bokeh.util.serialization import make_id
 
 from fusion.app.parts import schedule_update
 from fusion.report.charts.models import Model, document
@@ -20,7 +21,8 @@ Ends: TypeAlias = tuple[float, float]
 
 def figure_of(drawn: Model) -> Any:
     """Return a chart of the report as a model of the library, which a page changes while it is shown."""
-    read = Document.from_json(document(drawn))
+    # A page holds many charts, whose models are told apart by their names.
+    read = Document.from_json(document(drawn, names=f"{make_id()}-"))
     (root,) = read.roots
     read.clear()  # a model belongs to one document
     return root

@@ -19,7 +19,7 @@ from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.library import describe_effect
 from fusion.common.messages import cell, printable
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window
-from fusion.results.loop import ERROR_BY_CHANCE, ChannelErrors, Loop, ModelError, Range, RecordLoop
+from fusion.results.loop import ERROR_BY_CHANCE, ChannelErrors, DriftShare, Loop, ModelError, Range, RecordLoop
 from fusion.results.numbers import (
     alike,
     decimals_of,
@@ -247,9 +247,9 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
-        anomaly_cause, anomaly_place, caption, condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first,
-        limited, measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words, small,
-        upper_first, variance_left, whole_percent,
+        anomaly_cause, anomaly_place, by_effect, caption, condition, conditional, counted, drift_size, duration, exact, fixed, gain,
+        limited, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words,
+        small, upper_first, variance_left, whole_percent,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {
@@ -449,6 +449,17 @@ def better_plain(loop: Loop) -> PlainPrediction | None:
 def variance_left(share: float | None) -> str:
     """Return the share of a variance that a prediction leaves, in per cent; "all" where the mean itself would leave less."""
     return "–" if share is None else "all" if share > 1.0 else f"{number(100 * share, 2)} %"
+
+
+def by_effect(parts: Iterable[DriftShare]) -> list[DriftShare]:
+    """Return what the drift follows with each effect once, in their order: several sudden steps have one share together."""
+    together: dict[str, DriftShare] = {}
+    for part in parts:
+        before = together.get(part.effect)
+        together[part.effect] = (
+            part if before is None else before.model_copy(update={"share": (before.share or 0.0) + (part.share or 0.0)})
+        )
+    return list(together.values())
 
 
 def whole_percent(share: float) -> str:

@@ -6,7 +6,7 @@ import gzip
 import math
 from base64 import b64encode
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from importlib import metadata
 from typing import Any
 
@@ -71,11 +71,12 @@ def source(columns: Mapping[str, Any]) -> Model:
     return Model("ColumnDataSource", data=dict(columns))
 
 
-def document(root: Model) -> dict[str, Any]:
-    """Return a document of one model as JSON, in the format of ``Document.to_json`` of Bokeh 3."""
+def document(root: Model, names: str = "p") -> dict[str, Any]:
+    """Return a document of one model as JSON, in the format of ``Document.to_json`` of Bokeh 3; models are called `names` and a number."""
     config = Model("DocumentConfig", notifications=Model("Notifications"))
     known: dict[int, str] = {}
-    parts = {"config": _encoded(config, known), "roots": [_encoded(root, known)]}
+    encode = partial(_encoded, known=known, names=names)
+    parts = {"config": encode(config), "roots": [encode(root)]}
     return {"version": _version(), "title": "", **parts}
 
 
@@ -84,15 +85,16 @@ def _version() -> str:
     return metadata.version("bokeh")
 
 
-def _encoded(value: Any, known: dict[int, str]) -> Any:
+def _encoded(value: Any, known: dict[int, str], names: str) -> Any:
     """Return a value in the notation of BokehJS; a model that was written before is named."""
     if isinstance(value, str | bool | int | None):
         return value
+    encode = partial(_encoded, known=known, names=names)
     if isinstance(value, Model):
         if (name := known.get(id(value))) is not None:
             return {"id": name}
-        name = known[id(value)] = f"p{len(known)}"
-        attributes = {key: _encoded(one, known) for key, one in value.properties.items()}
+        name = known[id(value)] = f"{names}{len(known)}"
+        attributes = {key: encode(one) for key, one in value.properties.items()}
         return {"type": "object", "name": value.kind, "id": name, "attributes": attributes}
     if isinstance(value, np.generic | np.ndarray) and value.dtype.kind == "M":
         # Milliseconds since 1970.
@@ -100,7 +102,7 @@ def _encoded(value: Any, known: dict[int, str]) -> Any:
     if isinstance(value, np.ndarray):
         return _array(value)
     if isinstance(value, np.generic):
-        return _encoded(value.item(), known)
+        return encode(value.item())
     if isinstance(value, float):
         return (
             value if math.isfinite(value) else {"type": "number", "value": str(value).replace("inf", "+inf", value > 0)}
@@ -108,8 +110,8 @@ def _encoded(value: Any, known: dict[int, str]) -> Any:
     if isinstance(value, Mapping):
         if "type" in value:
             return dict(value)
-        return {"type": "map", "entries": [[_encoded(key, known), _encoded(one, known)] for key, one in value.items()]}
-    return [_encoded(one, known) for one in value]
+        return {"type": "map", "entries": [[encode(key), encode(one)] for key, one in value.items()]}
+    return [encode(one) for one in value]
 
 
 def _array(values: np.ndarray) -> Any:
