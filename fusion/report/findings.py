@@ -35,7 +35,7 @@ def headline(results: Results) -> str:
 
 
 #: Most actions on the first screen, and words of each.
-_FIRST_STEPS, _WORDS = 3, 14
+_FIRST_STEPS, _WORDS = 2, 14
 #: Most of them on the terminal.
 _PRINTED_STEPS = 2
 _BRACKETS = re.compile(r" \([^()]*\)")
