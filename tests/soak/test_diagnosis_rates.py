@@ -47,7 +47,7 @@ def test_right_names_and_no_wrong_ones(cause):
     print(f"\n{cause}: {dict(names)}; {right} {rate(names[right], RUNS)}")
     if right in THRESHOLDS:
         by_threshold = {
-            tried: round(float(np.mean([d.evidence[f"probability_{right}"] >= tried for d in diagnoses])), 2)
+            tried: round(float(np.mean([(d.evidence[f"probability_{right}"] or 0.0) >= tried for d in diagnoses])), 2)
             for tried in TRIED
         }
         print(f"  share with probability of {right} above a threshold: {by_threshold}; set: {THRESHOLDS[right]}")
