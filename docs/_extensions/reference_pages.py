@@ -58,14 +58,9 @@ def api_page(folder: str, modules: list[str]) -> str:
     title = f"{folder}"
     lines = [title, "=" * len(title), ""]
     for module in modules:
-        if module == folder:
-            lines += [f".. automodule:: {module}", "   :no-members:", ""]
-            continue
         name = module.removeprefix(f"{folder}.")
+        lines += [] if module == folder else [name, "-" * len(name), ""]
         lines += [
-            name,
-            "-" * len(name),
-            "",
             f".. automodule:: {module}",
             "   :members:",
             "   :ignore-module-all:",
