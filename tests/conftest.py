@@ -20,10 +20,11 @@ def pytest_configure(config):
 
     build = config.rootpath / "build"
     build.mkdir(exist_ok=True)
-    lock, compile_alone = FileLock(build / "compiled.lock"), Dispatcher.compile
+    compile_alone = Dispatcher.compile
 
     def compile_or_load(self: Dispatcher, signature: Any) -> Any:
-        with lock:
+        # One lock of each process: a kernel compiles those that it calls, and a child that was forked has none of its parent's.
+        with FileLock(build / "compiled.lock", is_singleton=True):
             return compile_alone(self, signature)
 
     Dispatcher.compile = compile_or_load
