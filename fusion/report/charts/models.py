@@ -5,12 +5,15 @@ from __future__ import annotations
 import gzip
 import math
 from base64 import b64encode
-from collections.abc import Mapping
-from functools import cache, partial
+from collections.abc import Callable, Mapping
+from functools import cache
 from importlib import metadata
 from typing import Any
 
 import numpy as np
+
+#: Numbers that JSON does not know, as BokehJS writes them.
+_NOT_FINITE = {"nan": "nan", "inf": "+inf", "-inf": "-inf"}
 
 
 class Model:
@@ -73,9 +76,19 @@ def source(columns: Mapping[str, Any]) -> Model:
 
 def document(root: Model, names: str = "p") -> dict[str, Any]:
     """Return a document of one model as JSON, in the format of ``Document.to_json`` of Bokeh 3; models are called `names` and a number."""
-    config = Model("DocumentConfig", notifications=Model("Notifications"))
     known: dict[int, str] = {}
-    encode = partial(_encoded, known=known, names=names)
+
+    def encode(value: Any) -> Any:
+        if not isinstance(value, Model):
+            return _encoded(value, encode)
+        # A model that was written before is named.
+        if (name := known.get(id(value))) is not None:
+            return {"id": name}
+        name = known[id(value)] = f"{names}{len(known)}"
+        attributes = {key: encode(one) for key, one in value.properties.items()}
+        return {"type": "object", "name": value.kind, "id": name, "attributes": attributes}
+
+    config = Model("DocumentConfig", notifications=Model("Notifications"))
     parts = {"config": encode(config), "roots": [encode(root)]}
     return {"version": _version(), "title": "", **parts}
 
@@ -85,17 +98,10 @@ def _version() -> str:
     return metadata.version("bokeh")
 
 
-def _encoded(value: Any, known: dict[int, str], names: str) -> Any:
-    """Return a value in the notation of BokehJS; a model that was written before is named."""
+def _encoded(value: Any, encode: Callable[[Any], Any]) -> Any:
+    """Return a value that is no model in the notation of BokehJS, what it holds by `encode`."""
     if isinstance(value, str | bool | int | None):
         return value
-    encode = partial(_encoded, known=known, names=names)
-    if isinstance(value, Model):
-        if (name := known.get(id(value))) is not None:
-            return {"id": name}
-        name = known[id(value)] = f"{names}{len(known)}"
-        attributes = {key: encode(one) for key, one in value.properties.items()}
-        return {"type": "object", "name": value.kind, "id": name, "attributes": attributes}
     if isinstance(value, np.generic | np.ndarray) and value.dtype.kind == "M":
         # Milliseconds since 1970.
         value = value.astype("datetime64[us]").astype(float) / 1000.0
@@ -104,9 +110,7 @@ def _encoded(value: Any, known: dict[int, str], names: str) -> Any:
     if isinstance(value, np.generic):
         return encode(value.item())
     if isinstance(value, float):
-        return (
-            value if math.isfinite(value) else {"type": "number", "value": str(value).replace("inf", "+inf", value > 0)}
-        )
+        return value if math.isfinite(value) else {"type": "number", "value": _NOT_FINITE[str(value)]}
     if isinstance(value, Mapping):
         if "type" in value:
             return dict(value)
