@@ -31,7 +31,7 @@ from interferometry.drift.gls import (
     typical_memory,
     von_neumann_p_value,
 )
-from interferometry.drift.kalman import Order, Smoothed
+from interferometry.drift.kalman import Order
 
 # Shapes along the axis that a drift may have by name, and the share of each in a reading.
 
@@ -499,11 +499,12 @@ def _rates(joint: JointFit, coefficients: Array) -> Array:
     return rates
 
 
-def _drift_from_state(joint: JointFit, smoothed: Smoothed, at_state: _StateDrift) -> tuple[Array, Array, Array]:
+def _drift_from_state(joint: JointFit, at_state: _StateDrift) -> tuple[Array, Array, Array]:
     """Return the drift from the thermal state (n, components) and its covariance (n, components, components) in um and um2, and the
     variance of the smoothing errors (n,) by the coefficients.
     """
-    fit, hours = joint.fit, joint.fit.system.seconds[:, None] / 3600.0
+    fit, smoothed = joint.fit, joint.fit.smoothed
+    hours = fit.system.seconds[:, None] / 3600.0
     drift = smoothed.levels[:, :, 0] + hours * _rates(joint, fit.coefficients) - at_state.drift
     joined = (
         smoothed.level_covariance + at_state.covariance - at_state.with_drift - at_state.with_drift.transpose(0, 2, 1)
@@ -519,24 +520,21 @@ def _drift_from_state(joint: JointFit, smoothed: Smoothed, at_state: _StateDrift
 def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr.Dataset:
     """Return the joint estimate as a Dataset; see `estimate_drift`."""
     fit, grid = joint.fit, _Grid(deviations, joint)
-    smoothed = fit.system.smooth(fit.residual()[:, None])
     cycle = joint.readings["cycle"].values
     at_state = _drift_at_state(joint, state_weights(fit.system.seconds, cycle, state))
-    drift, covariance, by_coefficients = _drift_from_state(joint, smoothed, at_state)
+    drift, covariance, by_coefficients = _drift_from_state(joint, at_state)
     in_first = cycle == cycle[0]
-    since_first = _drift_from_state(joint, smoothed, _drift_at_state(joint, in_first / np.count_nonzero(in_first)))
+    since_first = _drift_from_state(joint, _drift_at_state(joint, in_first / np.count_nonzero(in_first)))
     resolution_um = float(joint.readings["resolution"])
     if fit.system.memory is None:
-        of_noise, variance = (
-            fit.deletion_residuals(ROUNDING * resolution_um),
-            _deletion_variance(joint, smoothed, by_coefficients),
-        )
+        of_noise = fit.deletion_residuals(ROUNDING * resolution_um)
+        square, worth = _deletion_variance(joint, by_coefficients)
     else:
-        of_noise, variance = _whole_noise(joint, ROUNDING * resolution_um)
-    scatter, freedom = _scatter(joint, of_noise, *variance)
+        of_noise, square, worth = _whole_noise(joint, ROUNDING * resolution_um)
+    scatter, freedom = _scatter(joint, of_noise, square, worth)
     standardised = grid.per_reading(of_noise)
     standardised[grid.is_left_out(deviations)] = np.inf
-    noise = fit.system.independent * smoothed.u[:, 0]
+    noise, _ = fit.noise()
     excess = _excess_variance(scatter, freedom, joint) + _memory_variance(grid.per_reading(noise), joint)
     # A shape comes from the readings of its target, and is as uncertain as they are.
     target, shapes = joint.cells[joint.cell, 1], drift[:, drift.shape[1] - joint.shapes.shape[1] :]
@@ -625,9 +623,10 @@ def _reversal(cells: NDArray[np.int64], profile: Array, covariance: Array, targe
     return reversal, np.sqrt(np.maximum(variance, 0.0))
 
 
-def _deletion_variance(joint: JointFit, smoothed: Smoothed, by_coefficients: Array) -> tuple[Array, Array]:
+def _deletion_variance(joint: JointFit, by_coefficients: Array) -> tuple[Array, Array]:
     """Return squares of the noise of every reading, um2, from what all others predict, and their degrees of freedom."""
-    fit, D = joint.fit, smoothed.D
+    fit, smoothed = joint.fit, joint.fit.smoothed
+    D = smoothed.D
     expected = D - by_coefficients / fit.sigma**2
     with np.errstate(divide="ignore", invalid="ignore"):
         remaining = expected / D
@@ -635,7 +634,7 @@ def _deletion_variance(joint: JointFit, smoothed: Smoothed, by_coefficients: Arr
     return square, np.where(remaining > 1e-6, remaining * np.minimum(D * fit.system.variance, 1.0), 0.0)
 
 
-def _whole_noise(joint: JointFit, least_sigma: float) -> tuple[Array, tuple[Array, Array]]:
+def _whole_noise(joint: JointFit, least_sigma: float) -> tuple[Array, Array, Array]:
     """Return the noise of every reading in standard deviations of an ordinary one, and its squares, um2, with their degrees of freedom: all
     that the drift leaves. What neighbours predict where the noise has a memory depends on their scatter as well.
     """
@@ -647,7 +646,7 @@ def _whole_noise(joint: JointFit, least_sigma: float) -> tuple[Array, tuple[Arra
     with np.errstate(divide="ignore", invalid="ignore"):
         standardised = noise / (max(fit.sigma, least_sigma) * np.sqrt(known * left))
         square = noise**2 / left + fit.sigma**2 * unknown
-    return standardised, (square, left * known)
+    return standardised, square, left * known
 
 
 def _scatter(joint: JointFit, standardised: Array, square: Array, worth: Array) -> tuple[Array, Array]:

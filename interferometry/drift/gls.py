@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -156,13 +156,17 @@ class DriftFit:
         """Response minus fixed effects, drift included, (n,)."""
         return self.response - self.design @ self.coefficients
 
+    @cached_property
+    def smoothed(self) -> Smoothed:
+        """What all readings say of the drift at each of them: the residual, smoothed."""
+        return self.system.smooth(self.residual()[:, None])
+
     def drift(self) -> tuple[Array, Array]:
         """Drift levels at every reading (n, components) and their covariance (n, components, components)."""
-        smoothed = self.system.smooth(self.residual()[:, None])
-        covariance = self.sigma**2 * smoothed.level_covariance
+        covariance = self.sigma**2 * self.smoothed.level_covariance
         for _, share in self.shares():
             covariance += np.einsum("nip,njp->nij", share.levels, share.levels)
-        return smoothed.levels[:, :, 0], covariance
+        return self.smoothed.levels[:, :, 0], covariance
 
     def shares(self) -> Iterator[tuple[Array, Smoothed]]:
         """Parts (p, some) of the coefficients' uncertainty that are independent, of unit variance, and what is smoothed of each."""
@@ -175,12 +179,11 @@ class DriftFit:
 
     def noise(self) -> tuple[Array, Array]:
         """Each reading's estimated noise (n,) and its relative variance (n,): sum(noise^2) / sum(variance) estimates sigma^2."""
-        smoothed = self.system.smooth(self.residual()[:, None])
-        return self.system.independent * smoothed.u[:, 0], self.system.independent**2 * smoothed.D
+        return self.system.independent * self.smoothed.u[:, 0], self.system.independent**2 * self.smoothed.D
 
     def whole_noise(self) -> tuple[Array, Array]:
         """What the drift leaves of each reading, with what it shares with others (n,), and the variance of that drift in sigma^2 (n,)."""
-        loadings, smoothed = self.system.loadings, self.system.smooth(self.residual()[:, None])
+        loadings, smoothed = self.system.loadings, self.smoothed
         drift = np.einsum("nc,nc->n", loadings, smoothed.levels[:, :, 0])
         return self.residual() - drift, np.einsum("nc,ncd,nd->n", loadings, smoothed.level_covariance, loadings)
 
@@ -200,7 +203,7 @@ class DriftFit:
         """Each reading minus its prediction from all others, in standard deviations of an ordinary reading, of at least ``least_sigma``
         (n,); NaN if not observed.
         """
-        smoothed = self.system.smooth(self.residual()[:, None])
+        smoothed = self.smoothed
         with np.errstate(divide="ignore", invalid="ignore"):
             ordinary = 1.0 / smoothed.D + (1.0 - self.system.variance) * self.system.independent / self.system.variance
             standardised = (smoothed.u[:, 0] / smoothed.D) / (max(self.sigma, least_sigma) * np.sqrt(ordinary))
