@@ -259,15 +259,14 @@ def mixed_readings(linear: xr.Dataset) -> Found:
         return judge(0.0, _LEAST_MIXED, passed=True)
     # A reading far off says nothing of the others.
     steps = np.clip(steps / scatter_um, -_CLIPPED_AT, _CLIPPED_AT)
-    variance, pairs, correlations = np.nanmean(steps**2), 0, []
-    for lag in (2, 3, 4):
-        products = steps[..., :-lag] * steps[..., lag:]
-        of_lag = int(np.isfinite(products).sum())
-        pairs = pairs or of_lag
-        correlations.append(float(np.nanmean(products) / variance) if of_lag else 0.0)
-    two, *further = correlations
+    variance = np.nanmean(steps**2)
+    products = [steps[..., :-lag] * steps[..., lag:] for lag in (2, 3, 4)]
+    pairs = [np.count_nonzero(np.isfinite(one)) for one in products]
+    two, *further = (
+        float(np.nanmean(one) / variance) if count else 0.0 for one, count in zip(products, pairs, strict=True)
+    )
     # Bartlett 1946 for steps of independent readings; changes over the cycles share readings, which counts as much again.
-    u = 1.5 / np.sqrt(max(pairs, 1))
+    u = 1.5 / np.sqrt(max(float(pairs[0]), 1.0))
     # What swings from reading to reading correlates further on as well.
     passed = two >= min(_LEAST_MIXED, _MEMORY_AT_LEAST - 3.0 * u) or two >= -1.5 * max(map(abs, further))
     return judge(two, _LEAST_MIXED, passed=passed)
