@@ -19,7 +19,7 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from fusion.common import NO_PLUGINS
+from fusion.common import CAMPAIGN_FILE, NO_PLUGINS, campaign_file
 from fusion.common.messages import (
     ExitCode,
     Terminal,
@@ -293,12 +293,7 @@ def _progress(*, quiet: bool, json_progress: bool = False) -> Iterator[Report]:
 
 def _place(text: str) -> Path | str:
     """Return an address as it is written, anything else as a path: of a folder, that of the campaign file in it."""
-    if "://" in text:
-        return text
-    from fusion.common import CAMPAIGN_FILE
-
-    path = Path(text)
-    return path / CAMPAIGN_FILE if path.is_dir() else path
+    return text if "://" in text else campaign_file(Path(text))
 
 
 def _here(place: Path | str, what: str) -> Path:
@@ -505,7 +500,7 @@ def simulate(
 
     with _answering(), _progress(quiet=False) as report:
         simulate_campaign(recipe, out, progress=lambda done, total, what: report(what, done, total))
-        console.print(f"campaign: {(out / 'campaign.toml').resolve()}", soft_wrap=True)
+        console.print(f"campaign: {(out / CAMPAIGN_FILE).resolve()}", soft_wrap=True)
 
 
 @app.command()
@@ -516,7 +511,7 @@ def demo(
 ) -> None:
     """Simulate a campaign of known truth and run it: the first report in a minute, without files of one's own."""
     simulate(Path("demo"), out)
-    run([str(out / "campaign.toml")], out=out / "results")
+    run([str(out)], out=out / "results")
 
 
 @app.command()

@@ -13,7 +13,7 @@ import panel as pn
 from fusion.app import parts as ui
 from fusion.app.results.charts import shown_if
 from fusion.campaign.config import load_campaign
-from fusion.common import FusionError
+from fusion.common import CAMPAIGN_FILE, FusionError
 from fusion.common.messages import reported
 from fusion.pipeline.watch import Enough, FinishedCycle, LiveState, follow
 from fusion.report.charts.plan import LAYERS, draw_map, extent_of
@@ -181,7 +181,7 @@ class LiveScreen:
         self._state = state
         self._session: LiveSession | None = None
         self._seen = -1
-        beginning = state.campaign or (state.folder or state.root) / "campaign.toml"
+        beginning = state.campaign or (state.folder or state.root) / CAMPAIGN_FILE
         self._campaign = ui.text_field("Campaign file of the running test", beginning)
         wanted = {"label": "Wanted standard uncertainty of a position / µm", "value": 0.1, "start": 0.001, "step": 0.01}
         self._wanted = pn.widgets.FloatInput(**wanted, width=330)

@@ -14,7 +14,7 @@ import param
 from tornado.web import RequestHandler
 
 from fusion.app.runs import RUNS
-from fusion.common import FusionError
+from fusion.common import CAMPAIGN_FILE, FusionError
 from fusion.common.messages import printable, reported
 
 _ROLES = {"fault": ' role="alert"', "warning": ' role="status"', "done": ' role="status"'}
@@ -240,7 +240,7 @@ class State(param.Parameterized):
 def state_of(root: Path) -> State:
     """Return the state with which a page opens."""
     top, run = root.resolve(), RUNS.latest
-    campaign, results = (run.campaign, run.results) if run else (top / "campaign.toml", top / "results")
+    campaign, results = (run.campaign, run.results) if run else (top / CAMPAIGN_FILE, top / "results")
     return State(
         root=top,
         folder=campaign.parent,

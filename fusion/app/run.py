@@ -9,6 +9,7 @@ import panel as pn
 
 from fusion.app import parts as ui
 from fusion.app.runs import RUNS, RunError, RunProcess, is_begun
+from fusion.common import CAMPAIGN_FILE
 from fusion.common.messages import ExitCode
 from fusion.pipeline.resume import noted_campaign
 from fusion.results.store import finished_stages, noted_messages
@@ -42,7 +43,7 @@ class RunScreen:
         if campaign is not None and campaign == self._taken:
             return
         self._taken = campaign
-        chosen = campaign or (self._state.folder or self._state.root) / "campaign.toml"
+        chosen = campaign or (self._state.folder or self._state.root) / CAMPAIGN_FILE
         run = RUNS.latest
         results = run.results if run is not None and run.campaign == chosen else chosen.parent / "results"
         self._campaign.value, self._results.value = str(chosen), str(results)

@@ -59,7 +59,7 @@ from fusion.campaign.values import (
     split_uncertainty,
     stored_path,
 )
-from fusion.common import CAMPAIGN_FILE, FusionError, suggest
+from fusion.common import FusionError, campaign_file, suggest
 from fusion.common.messages import near_file
 from fusion.common.toml_files import TomlError, describe, first_faults, place_in, read_toml
 from fusion.results.store import is_text
@@ -1169,9 +1169,7 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
         ...
     fusion.campaign.config.CampaignError: ...absent.toml: no such campaign file; ...
     """
-    path = Path(path).resolve()
-    if path.is_dir():
-        path /= CAMPAIGN_FILE
+    path = campaign_file(Path(path).resolve())
     try:
         content, text = read_toml(path)
     except FileNotFoundError:

@@ -31,6 +31,11 @@ _PACKAGES = (
 NO_PLUGINS = "THERMOFUSE_NO_PLUGINS"
 
 
+def campaign_file(path: Path) -> Path:
+    """Return the campaign file that is meant by a path: of a folder, that in it."""
+    return path / CAMPAIGN_FILE if path.is_dir() else path
+
+
 class FusionError(ValueError):
     """Input that cannot be used; the message names the place, the value and the remedy.
 

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import xarray as xr
 
+from fusion.common import CAMPAIGN_FILE
 from fusion.twin.recipe import RecipeError
 
-#: What makes a folder a campaign; it comes last into a folder that existed.
-CAMPAIGN_FILE = "campaign.toml"
 #: Ends the name of a folder that is being written, which begins with a dot.
 PARTIAL = ".partial"
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion.common import CAMPAIGN_FILE
 from fusion.twin.camera import KELVIN, SC660, Renderer, fiducial_points, make_view
-from fusion.twin.folders import CAMPAIGN_FILE, check_free, whole_folders, write_truth_nc
+from fusion.twin.folders import check_free, whole_folders, write_truth_nc
 from fusion.twin.machine import stream
 from fusion.twin.recipe_file import find_recipe, read_recipe
 from fusion.twin.record import simulate_record, write_record

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from scipy.linalg import expm
 
-from fusion.common import Array
+from fusion.common import CAMPAIGN_FILE, Array
 from fusion.twin.effects import EFFECTS
 from fusion.twin.folders import write_truth_nc
 from fusion.twin.machine import Session, first_order, random_levels, stream
@@ -168,7 +168,7 @@ def write_record(truth: RecordTruth, out: Path, truth_folder: Path) -> Path:
     how: dict[str, Any] = {"fmt": "%.10g", "delimiter": ",", "header": ",".join(headings), "comments": ""}
     np.savetxt(out / "record.csv", np.transpose(columns), **how)
     wanted = ", ".join(json.dumps(f"{name} [um]") for name in table["channel"].values)
-    (out / "campaign.toml").write_text(
+    (out / CAMPAIGN_FILE).write_text(
         f"""[campaign]
 title = {json.dumps(truth.recipe.campaign.title)}
 
@@ -186,7 +186,7 @@ drivers = ["spindle speed*"]
     rms = {name: float(_centred_rms(table[name].values)) for name in truth.parts}
     content = {"recipe": asdict(truth.recipe), "parts_rms_um": rms, "undeclared": [e.name for e in truth.recipe.effect]}
     (truth_folder / "truth.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    return out / "campaign.toml"
+    return out / CAMPAIGN_FILE
 
 
 def solve_parts(duty: Array, axes: Array, air: Array, step_s: float) -> Array:
