@@ -165,15 +165,14 @@ def draw(
     own = {key: given for key, given in looks.items() if isinstance(given, list | np.ndarray)}
     held = source({}) if columns is None else columns
     held.data.update(own)
-    looks |= dict.fromkeys(own, None)
+
+    def of_column(key: str, given: Any) -> Any:
+        if key in own:
+            return field(key)
+        return field(given) if isinstance(given, str) and given in held.data else given
 
     def glyph(looks: Mapping[str, Any]) -> Model:
-        fields = {key: key if key in own else given for key, given in looks.items()}
-        told = {
-            key: field(given) if isinstance(given, str) and given in held.data else given
-            for key, given in fields.items()
-        }
-        return Model(kind, **told)
+        return Model(kind, **{key: of_column(key, given) for key, given in looks.items()})
 
     mark = Model(
         "GlyphRenderer", data_source=held, glyph=glyph(looks), level=level, hover_glyph=glyph(looks | hovered) if hovered else None,
