@@ -1,12 +1,9 @@
-"""Damaged laser files: mutations of one small file of each kind, through the readers that a user's file meets."""
+"""Small laser files of each kind, and how they are damaged."""
 
 from pathlib import Path
 
 import numpy as np
 import openpyxl
-
-from interferometry.io.faults import LaserFormatError
-from interferometry.io.readings import is_environment_log, read_deviations, read_environment
 
 #: Pieces that damage or odd programs put into files.
 PIECES = (
@@ -45,14 +42,6 @@ def _workbook(folder: Path) -> bytes:
     return path.read_bytes()
 
 
-def _read_any(path: Path) -> object:
-    return (
-        read_environment(path)
-        if is_environment_log(path)
-        else read_deviations(path, feed_mm_per_min=1000.0, dwell_s=2.0)
-    )
-
-
 def _mutated(content: bytes, rng: np.random.Generator) -> bytes:
     """Return the content after one to three changes: bits, pieces put in, parts cut out, exchanged or repeated, or the end cut off."""
     changed = bytearray(content)
@@ -73,33 +62,3 @@ def _mutated(content: bytes, rng: np.random.Generator) -> bytes:
             case _ if rng.random() < 0.3:
                 del changed[at:]
     return bytes(changed)
-
-
-def fuzz(folder: Path, number: int, *, seed: int) -> dict[str, tuple[int, int]]:
-    """Return how many of the mutated files of each kind were read and refused; any error other than LaserFormatError passes through."""
-    contents = {
-        "long.csv": LONG.encode(),
-        "wide.csv": WIDE.encode(),
-        "utf16.csv": WIDE.encode("utf-16"),
-        "environment.csv": LOG.encode(),
-        "test.rtl": RTL.encode(),
-        "log.dat": ECMC.encode(),
-        "long.xlsx": _workbook(folder),
-    }
-    rng = np.random.default_rng(seed)
-    counts = dict.fromkeys(contents, (0, 0))
-    for i in range(number):
-        name, content = list(contents.items())[i % len(contents)]
-        path = folder / name
-        path.write_bytes(_mutated(content, rng))
-        taken, refused = counts[name]
-        try:
-            _read_any(path)
-            counts[name] = taken + 1, refused
-        except LaserFormatError as error:
-            assert str(path) in str(error), f"{name}: {error} does not name the file"
-            counts[name] = taken, refused + 1
-        except Exception as error:
-            path.with_name(f"{seed}_{i}_{name}").write_bytes(path.read_bytes())
-            raise AssertionError(f"mutation {i} of seed {seed}, {name}: {type(error).__name__}: {error}") from error
-    return counts

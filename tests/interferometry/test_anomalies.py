@@ -16,7 +16,7 @@ from interferometry.anomalies import (
 from interferometry.common import InterferometryError
 from interferometry.drift.estimate import estimate_drift
 from interferometry.drift.gls import Autoregression
-from tests.interferometry.simulated_campaigns import SIGMA_UM, recorded, simulate, with_memory
+from tests.interferometry.simulated_campaigns import SIGMA_UM, recorded, simulate
 
 pytestmark = pytest.mark.long
 
@@ -115,13 +115,6 @@ def test_a_level_that_is_no_probability_is_refused(level, rng):
     deviations, _ = simulate(rng, cycles=5)
     with pytest.raises(InterferometryError, match=f"level={level} is not a probability between 0 and 1"):
         detect_anomalies(deviations, estimate_drift(deviations), level=level)
-
-
-def test_noise_with_memory_that_all_positions_have_makes_no_anomaly():
-    """With cycles permuted as they are, a step would stand out in this campaign."""
-    rng = np.random.default_rng(880_004)
-    deviations, _ = simulate(rng, noise=0.4 * with_memory(rng.standard_normal((100, 2, 16)), 0.3))
-    assert not any(anomaly.stands_out for anomaly in anomalies_of(deviations))
 
 
 def test_a_motion_stands_out_only_where_it_exceeds_those_of_the_other_positions(rng):

@@ -57,37 +57,6 @@ def test_student_below_thirty_repetitions():
     assert float(coverage_factor(np.array(29))) == pytest.approx(stats.t.ppf(0.97725, 28), abs=1e-3)
 
 
-def test_paper_monte_carlo_ratio():
-    # Equation (10): sqrt 2. A ratio from 1,000 samples scatters by about 0.02 (the paper's 1.4076 lies 0.3 of that away).
-    sources = [np.random.default_rng(seed).standard_normal(1000) for seed in range(200)]
-    ratios = [np.diff(source).std(ddof=1) / source.std(ddof=1) for source in sources]
-    assert np.mean(ratios) == pytest.approx(np.sqrt(2), abs=4 * np.std(ratios) / np.sqrt(200))
-    assert abs(1.4076 - np.sqrt(2)) < 2 * np.std(ratios)
-
-
-@pytest.mark.parametrize("scale", [0.0, 1.0])
-def test_ratio_is_a_property_of_the_drift(scale):
-    ratios, predicted = [], []
-    for seed in range(12):
-        deviations, truth = simulate(np.random.default_rng(seed), scale=scale)
-        ratios.append(float(compare(deviations)["ratio"].sel(direction="positive", link=4)))
-        drift = truth.drift[:, 0, :]
-        s_drift, s_difference = drift[:, 3].std(ddof=1), (drift[:, 2] - drift[:, 3]).std(ddof=1)
-        predicted.append(np.sqrt((0.16 + s_drift**2) / (0.32 + s_difference**2)))
-    assert np.mean(ratios) == pytest.approx(np.mean(predicted), rel=0.05)
-    if scale == 0:
-        # Without drift nothing depends on the simulated shape: the ratio is 1 / sqrt 2, known here to 3 %.
-        assert np.mean(ratios) == pytest.approx(0.71, rel=0.06)
-
-
-def test_conventional_s_is_drift_and_differenced_s_is_not(rng):
-    deviations, _ = simulate(rng)
-    assert float(evaluate_conventional(deviations)["standard_deviation"].mean()) > 2.0
-    single = evaluate_neighbours(deviations)["position_standard_deviation"]
-    # Random part 0.4 um, plus the stretch between neighbours, which differencing does not remove.
-    assert 0.38 < float(single.mean()) < 0.47
-
-
 def test_three_standard_deviations_side_by_side(rng):
     deviations, _ = simulate(rng)
     table = compare(deviations, estimate_drift(deviations)).sel(direction="positive")

@@ -14,16 +14,10 @@ from fusion.results.progress import silent
 from fusion.twin import simulate
 from fusion.twin.instruments import write_campaign
 from fusion.twin.recipe import Recipe
-from fusion.twin.simulate import environment_log
-from tests.soak.rates import campaigns, first_seed, rate, wilson
-from tests.soak.test_sound_inputs import sound_recipe
-from thermography.radiometry.camera import LevelSeries, estimate_correction, room_temperatures
 
 pytestmark = pytest.mark.slow
 
 SMALL = {"columns": 320, "rows": 240, "focal_px": 765.0, "file": "seq"}
-#: Share of the room's temperature in what the wall beside the table sends to the camera, with emissivity 0.95 and the air's transmission.
-WALL = 0.93
 SEEDS = (11, 12, 13)
 
 
@@ -52,28 +46,3 @@ def test_rise_with_steps_and_drift(tmp_path: Path, ffc_step_K: float, drift_K_pe
         f"\nFFC {ffc_step_K} K, drift {drift_K_per_K} K/K: error of the rise {1e3 * np.mean(errors):.0f} mK, over u: {with_digits}"
     )
     assert max(ratios) < 2.0
-
-
-def test_sound_cameras_are_not_corrected(capsys: pytest.CaptureFixture[str]) -> None:
-    """Levels as the frames of the twin show them, without rendering them."""
-    runs, corrected = campaigns(200), {True: 0, False: 0}
-    for seed in range(first_seed(52000), first_seed(52000) + runs):
-        truth = simulate(sound_recipe(seed))
-        session, log = truth.session, environment_log(truth)
-        seconds, rng = session.frame_s, np.random.default_rng([seed, 5])
-        logged = (log["time"].values - log["time"].values[0]) / np.timedelta64(1, "s")
-        for known in corrected:
-            room = room_temperatures(seconds, logged, log["air_temperature"].values)
-            series = LevelSeries(
-                seconds=seconds,
-                background=WALL * session.at_frames(session.air_degC) + rng.normal(0, 5e-4, seconds.size),
-                table=session.at_frames(session.table_rise_K) + rng.normal(0, 5e-4, seconds.size),
-                housing=truth.frames["housing"].values[:, None] + np.array([273.15, 272.35]),
-                room=room if known else room[:, :0],
-            )
-            corrected[known] += estimate_correction(series).corrects
-    with capsys.disabled():
-        print(
-            f"\nsound cameras corrected: with a log of the air {rate(corrected[True], runs)}, without {rate(corrected[False], runs)}"
-        )
-    assert max(wilson(count, runs)[0] for count in corrected.values()) <= 0.02

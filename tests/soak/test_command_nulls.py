@@ -1,7 +1,8 @@
 """The whole command on campaigns in which nothing is missing, whatever the noise and the load: docs/method/closed-loop.md, table of nulls.
 
-Small pictures of the twin, run from files to results as a user runs them; its reading noise is replaced by one of five kinds of 0.35 um,
-under a constant load, a random load, and a room whose temperature has a rhythm. Counted is any statement that is not true: a name, a
+Small pictures of the twin, run from files to results as a user runs them; its reading noise is replaced by one of five kinds of 0.35 um
+(white, Laplace, a correlation of 0.45 between readings 6 s apart or of 0.5 from cycle to cycle at every position, growing), under a
+constant load, a random load, and a room whose temperature has a rhythm. Counted is any statement that is not true: a name, a
 remainder, an anomaly, a doubt of the inputs. THERMOFUSE_RUNS campaigns (100 by default) for each of the 15.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from multiprocessing import get_context
@@ -24,11 +26,38 @@ from fusion.pipeline.run import run_campaign
 from fusion.twin.recipe import Recipe
 from tests.soak.lies.campaigns import write
 from tests.soak.rates import campaigns, first_seed, rate, wilson
-from tests.soak.test_loop_nulls import NOISES, SIGMA_UM
 from tests.soak.test_sound_runs import statements_of
 
 pytestmark = pytest.mark.slow
 RUNS = campaigns(100)
+SIGMA_UM = 0.35
+
+
+def within_a_pass(rng: np.random.Generator, seconds: np.ndarray) -> np.ndarray:
+    order = np.argsort(seconds.ravel())
+    noise = rng.standard_normal(seconds.size)
+    kept = 0.45 ** (np.diff(seconds.ravel()[order]) / 6.0)
+    for before, at, share in zip(order[:-1], order[1:], kept, strict=True):
+        noise[at] = share * noise[before] + np.sqrt(1.0 - share**2) * noise[at]
+    return noise.reshape(seconds.shape)
+
+
+def over_the_cycles(rng: np.random.Generator, seconds: np.ndarray) -> np.ndarray:
+    noise = rng.standard_normal(seconds.shape)
+    for cycle in range(1, seconds.shape[0]):
+        noise[cycle] = 0.5 * noise[cycle - 1] + np.sqrt(0.75) * noise[cycle]
+    return noise
+
+
+NOISES: dict[str, Callable[[np.random.Generator, np.ndarray], np.ndarray]] = {
+    "white": lambda rng, seconds: rng.standard_normal(seconds.shape),
+    "laplace": lambda rng, seconds: rng.laplace(0.0, np.sqrt(0.5), seconds.shape),
+    "within a pass": within_a_pass,
+    "over the cycles": over_the_cycles,
+    "growing": lambda rng, seconds: (
+        rng.standard_normal(seconds.shape) * np.linspace(0.6, 1.4, len(seconds))[:, None, None]
+    ),
+}
 DUTIES: dict[str, dict[str, Any]] = {
     "constant duty": {"duty": {"kind": "constant"}},
     "random duty": {"duty": {"kind": "random", "mean_hold_min": 25.0}},

@@ -141,37 +141,6 @@ def reaches(by_run: list[float], low: float, high: float) -> bool:
     return bool(low - error <= np.mean(by_run) <= high + error)
 
 
-def two_way(deviations: xr.Dataset) -> np.ndarray:
-    """Scatter per position by taking offset and slope from every pass (statistics of a complete test, no drift model)."""
-    basis = np.column_stack([np.ones(TARGETS), PLACE])
-    maker = np.eye(TARGETS) - basis @ np.linalg.pinv(basis)
-    left = deviations["deviation"].values @ maker
-    left = left - left.mean(axis=0)
-    share = (maker**2) * (left.shape[0] - 1) * 2
-    return np.sqrt(np.linalg.solve(share, (left**2).sum(axis=(0, 1))))
-
-
-# A random walk that moves as much from pass to pass as a reading scatters takes a part of what the residuals could tell.
-@pytest.mark.parametrize(("kind", "bar_um"), [("warmup", 0.022), ("duty", 0.022), ("rw", 0.023)])
-def test_scatter_rmse(kind: str, bar_um: float) -> None:
-    scatter, checked = [], []
-    for seed in range(RUNS):
-        deviations, _ = simulate(np.random.default_rng(5000 + seed), kind=kind)
-        scatter.append(estimate_drift(deviations)["scatter_position"].values)
-        checked.append(two_way(deviations))
-    found = np.array(scatter) - SIGMA_UM
-    rmse, bias = float(np.sqrt(np.mean(found**2))), float(found.mean())
-    ratio = np.mean(scatter, axis=1) / np.mean(checked, axis=1)
-    print(
-        f"\nscatter {kind}: N={RUNS} rmse {rmse:.4f} bias {bias:+.4f}; against the two-way analysis "
-        f"{ratio.min():.3f} .. {ratio.max():.3f}"
-    )
-    error = float(np.mean(found**2, axis=1).std() / np.sqrt(RUNS) / (2 * rmse))
-    assert rmse <= bar_um + 2 * error
-    assert abs(bias) <= 0.015 * SIGMA_UM
-    assert np.abs(ratio - 1).max() <= 0.05
-
-
 def noise(
     rng: np.random.Generator,
     *,

@@ -169,12 +169,6 @@ def moved_positions(found: ProfileChange) -> list[tuple[str, float | None]]:
     ]
 
 
-def test_another_thermal_state_changes_no_position(rng: np.random.Generator) -> None:
-    """Nominal 5 %: of 100 pairs at most 11 (a binomial count exceeds that once in a hundred such tests)."""
-    alarms = sum(bool(moved_positions(compare_profiles(estimate(rng), estimate(rng), level=0.05))) for _ in range(100))
-    assert alarms <= 11
-
-
 def test_positions_that_moved_are_told_from_their_neighbours(rng: np.random.Generator) -> None:
     moved = np.zeros((2, 8))
     moved[:, 2], moved[0, 5] = 3.0, 1.5
@@ -272,12 +266,6 @@ def test_what_a_badly_known_thermal_state_may_make_is_no_change_and_is_told(
         assert found.untold[0] == 100.0 and 0.2 < found.untold[1] < 0.6
 
 
-def test_what_remains_has_no_slope_and_its_uncertainty(rng: np.random.Generator) -> None:
-    found = compare_profiles(estimate(rng), estimate(rng), level=0.05)
-    assert np.polyfit(found.position_mm, found.remaining_um, 1) == pytest.approx([0.0, 0.0], abs=1e-9)
-    assert (found.remaining_u_um < 0.1).all()
-
-
 def test_positions_of_one_test_alone_are_counted(rng: np.random.Generator) -> None:
     other = estimate(rng)
     other["position"] = other["position"] + xr.where(other["target"] == 8, 3.0, 0.0)
@@ -298,15 +286,6 @@ def test_other_targets_and_other_approaches_cannot_be_compared(rng: np.random.Ge
         compare_profiles(forward, backward, level=0.05)
 
 
-def test_a_repair_is_found_between_two_tests_of_the_twin_and_nothing_else() -> None:
-    before, after = readings_of(31), readings_of(32, duty="constant")
-    assert moved_positions(compare_profiles(drift_of(before), drift_of(after), level=0.05)) == []
-    found = compare_profiles(drift_of(before), drift_of(repaired(after, 1.0)), level=0.05)
-    assert moved_positions(found) == [("position", REPAIRED_MM)]
-    size = next(shape for shape in found.shapes if shape.position_mm == REPAIRED_MM)
-    assert size.change.value == pytest.approx(1.0, abs=4 * size.change.u)
-
-
 # Scatters of two tests.
 
 
@@ -316,18 +295,6 @@ PLACE = np.linspace(0.0, 300.0, 16)
 def sample(rng: np.random.Generator, freedom: int, sigma: np.ndarray | float = 1.0) -> np.ndarray:
     """Standard deviations of 16 positions."""
     return np.asarray(sigma * np.sqrt(rng.chisquare(freedom, 16) / freedom))
-
-
-def least_p(rng: np.random.Generator, freedoms: tuple[int, int], after: np.ndarray | float = 1.0) -> float:
-    one, other = sample(rng, freedoms[0]), sample(rng, freedoms[1], after)
-    found = compare_scatters(PLACE, one, other, *(np.full(16, float(freedom)) for freedom in freedoms))
-    return 16 * min(change.p_value for change in found)
-
-
-def test_equal_scatter_and_a_noisier_day_raise_no_alarm(rng: np.random.Generator) -> None:
-    """Nominal 5 %: of 300 pairs at most 25 (a binomial count exceeds that once in two hundred such tests)."""
-    for freedoms, day in (((60, 60), 1.0), ((30, 120), 2.5), ((8, 8), 1.0)):
-        assert sum(least_p(rng, freedoms, day) <= 0.05 for _ in range(300)) <= 25
 
 
 def test_a_position_that_repeats_worse_is_found(rng: np.random.Generator) -> None:

@@ -133,24 +133,6 @@ def test_finds_the_kind_of_drift_and_the_noise(rng, integrated):
         np.testing.assert_allclose(fit.drift_rate * np.sqrt(252.8 / 3600), [0.4, 0.3], rtol=0.45)
 
 
-def test_a_robust_fit_is_not_moved_by_gross_outliers(rng):
-    seconds, loadings, y, design = simulated_test(rng)
-    hit = rng.choice(y.size, 40, replace=False)
-    spoiled = y.copy()
-    spoiled[hit] += rng.choice([-1, 1], 40) * rng.uniform(5, 50, 40)
-    clean = estimate(seconds, loadings, y, design, order=1)
-    plain = estimate(seconds, loadings, spoiled, design, order=1)
-    robust = estimate(seconds, loadings, spoiled, design, order=1, robust=True)
-    profile = design.shape[1]
-
-    def error(fit):
-        difference = (fit.coefficients - clean.coefficients)[:profile]
-        return float(np.sqrt(np.mean((difference - difference.mean()) ** 2)))
-
-    # 40 of 1920 readings carry no information any more: 1 % more spread than the clean fit's 0.4 / sqrt(120) um.
-    assert error(robust) < 0.02 < error(plain)
-
-
 @pytest.mark.parametrize("memory", [None, Memory(0.6, 30.0)])
 @pytest.mark.parametrize(("order", "ratios"), [(1, [0.01, 0.02]), (2, [1e-6, 3e-6])])
 def test_the_average_of_the_drift_and_its_covariance_are_those_of_dense_algebra(rng, order, ratios, memory):
@@ -292,17 +274,6 @@ def test_readings_that_a_drift_follows_to_the_last_have_a_noise_all_the_same(rng
     )
     assert 0.0 < exact.sigma < 1e-4
     assert np.isfinite(exact.log_likelihood)
-
-
-def test_the_noise_of_a_quiet_laser_is_found_beside_a_large_smooth_drift(rng):
-    """10 nm beside 40 um that grow and turn in five hours; so quick a drift takes up to a fifth of the noise with it."""
-    seconds = np.sort(rng.uniform(0.0, 18000.0, 400))
-    site = rng.integers(0, 8, 400)
-    loadings = np.column_stack([np.ones(400), site / 7.0])
-    drift = 40.0 * np.sin(seconds / 4000.0) + 25.0 * (1.0 - np.exp(-seconds / 6000.0)) * loadings[:, 1]
-    fit = estimate(seconds, loadings, drift + rng.normal(0, 0.01, 400), np.eye(8)[site])
-    assert fit.system.order == 2
-    assert fit.sigma == pytest.approx(0.01, rel=0.25)
 
 
 def test_a_search_that_loses_a_component_begins_again_where_the_walk_found_it(rng, monkeypatch):

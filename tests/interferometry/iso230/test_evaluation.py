@@ -191,15 +191,6 @@ def test_windows_show_how_drift_enters_repeatability_and_accuracy(rng):
     assert float(windows["A"][-1]) > float(windows["A"][:-1].max())
 
 
-@pytest.mark.slow
-def test_the_reversal_error_that_scatter_alone_gives_is_met_by_half_of_such_tests():
-    rng = np.random.default_rng(12)
-    results = [evaluate_iso230(test_made(rng.normal(0.0, 0.5, (5, 2, 11)))) for _ in range(60)]
-    exceeded = np.mean([float(result["B"] - result["B_of_scatter"]) > 0 for result in results])
-    # Three standard deviations of a share of 60 about one half.
-    assert exceeded == pytest.approx(0.5, abs=3 * np.sqrt(0.25 / 60))
-
-
 def test_the_reversal_error_of_scatter_at_one_position_is_the_quartile_of_the_normal_distribution():
     """Five readings with s = 1 um from either side: means differ by 0.63 um (k = 1), in half of the tests by more than 0.67 times that."""
     x = np.repeat(np.array([-1.0, -1.0, 0.0, 1.0, 1.0])[:, None, None], 2, axis=1)

@@ -16,11 +16,8 @@ from fusion.analysis.attribution.correlate import (
     mode_cells,
     piece_with_peak,
 )
-from fusion.analysis.diagnosis.diagnose import diagnose
 from fusion.results.parts import AreaPart
-from fusion.twin.recipe import AnomalyRecipe
 from tests.fusion import field_simulator as simulator
-from tests.fusion.twin_sessions import CAUSES, Flag, session
 
 
 def peak(maps, channel="joint"):
@@ -111,13 +108,6 @@ def test_every_target_is_mapped_by_itself(maps):
     assert float(largest.sel(series="positive 1")) < float(largest.sel(series="positive 16"))
 
 
-def test_heavy_tails_do_not_raise_false_alarms(rng):
-    temperatures = simulator.film("rw", rng)
-    drift = 3.0 * simulator.smooth_series("rw", rng)
-    made = simulator.session(temperatures, drift, 0.5 * drift, rng, heavy_tails=True)
-    assert correlate(made.fused, thin(made.field), draws=99, checks=1).attrs["verdict"] == "not attributable"
-
-
 def test_wrong_dims_and_a_film_without_seen_cells_are_refused(null):
     with pytest.raises(CorrelationError, match=r"fields has 'frame_temperature' over \(time, y\) instead of"):
         correlate(null.fused, null.field.isel(x=0, drop=True))
@@ -170,13 +160,6 @@ def test_the_answer_comes_from_the_mode_of_the_right_source(maps):
     assert float(np.nanmax(maps["modes/pattern"])) == pytest.approx(1.0)
 
 
-def test_without_a_source_the_detection_limit_and_a_plan_are_stated(null):
-    maps = correlate(null.fused, null.field[:, ::4, ::4], draws=99, checks=1)
-    source = find_source(maps)
-    assert maps.attrs["verdict"] == "not attributable" and source.p_value > 0.05
-    assert source.detectable_um_per_K > 0.0
-
-
 def test_places_that_warm_alike_are_named_as_equal(rng):
     """Two halos of one switched source: nothing can tell which of them drives the axis."""
     course = simulator.source_responses("duty", rng)[1][:, 1]
@@ -193,16 +176,3 @@ def test_places_that_warm_alike_are_named_as_equal(rng):
 
 
 # Attribution and diagnosis on the twin, whose heat, drift and readings share nothing with the analysis.
-
-
-@pytest.mark.parametrize("kind", list(CAUSES))
-def test_a_target_that_misbehaves_gets_its_cause(kind):
-    fused, _ = session(3, anomaly=(AnomalyRecipe(5, kind, "both", 0.6),))
-    assert diagnose(fused, [Flag()])[0].cause == CAUSES[kind]
-
-
-def test_a_field_that_drives_the_axis_is_found_though_a_warm_up_dominates():
-    fused, film = session(0)
-    maps = correlate(fused, film, draws=99, checks=1)
-    assert maps.attrs["verdict"] == "attributable"
-    assert float(maps["p_value"].sel(channel="joint").min()) <= 0.05

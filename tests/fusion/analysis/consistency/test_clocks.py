@@ -28,7 +28,6 @@ from tests.fusion.analysis.consistency.twin_fields import (
     with_late,
     without_ends,
 )
-from tests.soak.lies.logs import starts
 
 
 @pytest.mark.long
@@ -238,13 +237,6 @@ def test_what_two_loads_heat_together_need_not_be_explained_by_either() -> None:
     log = test.drivers.assign(duty=("time", np.where(first, duty, 0.0)), other=("time", np.where(first, 0.0, duty)))
     check = of_load(field, log)["drivers_course"]
     assert check.passed and "with all that was logged" in check.evidence
-
-
-def test_a_log_of_starts_of_a_varying_load_is_doubted() -> None:
-    test = recorded(duty="random")
-    log = test.drivers.assign(duty=test.drivers["duty"].copy(data=starts(test.drivers["duty"].values)))
-    check = of_load(thin_fields(test.fields), log)["drivers_course"]
-    assert not check.passed and check.value > check.limit and "holds marks, as of starts" in check.evidence
 
 
 def test_a_load_that_drives_the_table_a_staircase_and_a_constant_one_are_loads() -> None:

@@ -391,11 +391,6 @@ def test_the_size_is_that_of_the_field_where_both_agree_within_three_uncertainti
     assert error.size_K == size
 
 
-def test_a_step_after_the_last_frame_touches_the_last_cycle_only() -> None:
-    (error,) = find_field_errors(camera_step(0.5, 0.1, jump=0.5, time_s=1e4), small_fields(), small_fused())
-    assert error.first_cycle == 6 and not error.course_K.any()
-
-
 def test_a_reflection_is_its_pattern_times_what_it_adds_to_its_lowest_state() -> None:
     """A patch of four cells in twenty-four that is brighter by 2 K in every other stretch of five frames, from the first on."""
     frames = 20

@@ -20,22 +20,18 @@ from fusion.analysis.drift_model.axis import (
     set_aside_sites,
 )
 from fusion.analysis.drift_model.closed_loop import close_loop
-from fusion.analysis.drift_model.search import Confirmed
-from fusion.analysis.effects.effect import Candidate, Effect, Prior
+from fusion.analysis.effects.effect import Effect, Prior
 from fusion.analysis.effects.library import library
-from fusion.results.loop import ResidualTestsPart
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
 from fusion.twin.truth import deviations_of, fields_of
 from tests.fusion import loop_bench
-from tests.fusion.loop_bench import effect_of
 from tests.fusion.small_campaign import campaign
 
 pytestmark = pytest.mark.chain
 
 DECLARED = ["axis_expansion", "table_offset"]
-UNTESTED = ResidualTestsPart.model_construct()
 AXIS = AxisGeometry((500.0, 90.0), (-1.0, 0.0))
 
 
@@ -92,15 +88,6 @@ def test_one_missing_effect_is_named_and_the_held_out_error_falls_to_the_noise(n
         assert "7" in str(step.parameters["possible_leads"])
 
 
-@pytest.mark.slow
-def test_an_unseen_source_that_follows_the_load_is_named():
-    readings = readings_of(EffectRecipe("unseen_heat_source", amplitude_um=0.8), seed=11)
-    found = close_loop(readings, DECLARED, effects=_few("unseen_heat_source", "thermal_lag"))
-    names = {step.effect for step in found.steps} | {name for step in found.steps for name in step.tied}
-    assert "unseen_heat_source" in names
-    assert found.rmse_final_um < 0.8 * found.rmse_declared_um
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -120,18 +107,6 @@ def test_an_effect_outside_the_library_is_left_without_a_name_and_described(name
         assert left.verdict == "complete"
 
 
-@pytest.mark.slow
-def test_an_event_among_the_hold_out_cycles_is_found_in_the_second_look():
-    step = EffectRecipe("step_event", amplitude_um=0.5, parameters={"at_cycle": 54})
-    found = close_loop(readings_of(step), DECLARED, effects=_few("step_event", "reversal_drift", "dead_path"))
-    assert [step.effect for step in found.steps] == ["step_event"]
-    (step,) = found.steps
-    assert step.confirmed and step.confirmed_by == Confirmed.SECOND_SEARCH
-    # It has no held-out error; the block around it is predicted better with it.
-    assert np.isnan(step.rmse_after_um) and step.cross_rmse_after_um < step.cross_rmse_before_um
-    assert found.rmse_final_um == found.rmse_declared_um
-
-
 def test_the_hold_out_cycles_do_not_touch_the_model_before_they_are_opened(complete):
     readings = readings_of()
     held_out = readings.cycle > 48
@@ -139,18 +114,6 @@ def test_the_hold_out_cycles_do_not_touch_the_model_before_they_are_opened(compl
     found = close_loop(spoiled, DECLARED, effects=_few("reversal_drift"))
     np.testing.assert_array_equal(found.before.fit.coefficients, complete.before.fit.coefficients)
     assert found.rmse_declared_um > 40.0
-
-
-def test_a_users_effect_enters_the_search():
-    def candidates(readings, coefficients, near):
-        yield Candidate(np.sin(readings.seconds / 700.0)[:, None] * (readings.target[:, None] == 5), {}, ("um",))
-
-    readings = readings_of()
-    hidden = 1.5 * np.sin(readings.seconds / 700.0) * (readings.target == 5)
-    own = Effect("loose_scale", "The scale's clamp at target 5 breathes.", "own observation", candidates)
-    changed = replace(readings, response=readings.response + hidden)
-    found = close_loop(changed, DECLARED, effects={**_few("reversal_drift", "pitch_error"), "loose_scale": own})
-    assert "loose_scale" in [step.effect for step in found.steps]
 
 
 def test_a_users_effect_that_raises_is_named_and_the_rest_goes_on():
@@ -193,64 +156,8 @@ def test_too_few_cycles_are_refused():
         readings_of(cycles=3)
 
 
-@pytest.mark.slow
-def test_what_could_be_found_is_found_at_that_size():
-    """An effect at twice the size that is found in 80 % of campaigns is found; the size of a reversal is set by the noise alone."""
-    few = _few("reversal_drift", "pitch_error", "dead_path")
-    told = {
-        one.effect: one for one in close_loop(readings_of(), DECLARED, effects=few).state.rounds[0].detection_limits
-    }
-    size = 2.0 * told["reversal_drift"].detectable_um
-    # 1,500 readings of 0.4 um: 0.4 / sqrt(1500) = 0.01 um is one standard deviation of the size, and about four are asked for.
-    assert 0.04 < size < 0.2
-    found = close_loop(readings_of(EffectRecipe("reversal_drift", amplitude_um=size), seed=15), DECLARED, effects=few)
-    assert "reversal_drift" in [step.effect for step in found.steps]
-    assert "leads of 20, 10" in told["pitch_error"].note
-
-
 def _few(*names: str) -> dict[str, Effect]:
     return {name: library()[name] for name in (*DECLARED, *names)}
-
-
-@pytest.mark.slow
-def test_one_jump_of_the_camera_is_named_once():
-    """Weighed by the coefficients of two rounds its column differs, and both columns become one when they settle."""
-    readings = readings_of(effect_of("camera_offset", 0.4, 9007), seed=9007)
-    found = close_loop(readings, DECLARED, effects=_few("camera_offset", "reversal_drift"))
-    events = [term.candidate.event_s for term in found.after.terms if term.effect == "camera_offset"]
-    assert len(events) == len(set(events)) >= 1
-
-
-@pytest.mark.slow
-def test_the_hold_out_set_judges_an_effect_beside_the_others():
-    """Either of two missing effects is judged with the other in the model; both are right."""
-    missing = ("air_index", "reversal_drift")
-    readings = readings_of(*(effect_of(name, 0.4, 21001) for name in missing), seed=21001)
-    found = close_loop(readings, DECLARED, effects=_few(*missing))
-    assert {step.effect for step in found.steps} == set(missing)
-    assert all(step.lowers_error and not step.withheld for step in found.steps)
-    assert found.steps[-1].rmse_after_um < found.steps[0].rmse_before_um
-
-
-@pytest.mark.slow
-def test_a_laser_that_warms_up_is_no_heat_source():
-    """The memory of a body that starts warm decays alike, but that is no evidence for the load."""
-    laser = effect_of("laser_warm_up", 0.4, 22004)
-    few = _few("laser_warm_up", "unseen_heat_source")
-    found = close_loop(readings_of(laser, seed=22004), DECLARED, effects=few)
-    assert [step.effect for step in found.steps] == ["laser_warm_up"]
-
-
-@pytest.mark.slow
-def test_an_event_among_the_hold_out_cycles_does_not_hide_what_acts_beside_it():
-    """The source is decided on the training cycles, which say nothing of the event: the error after holds the event in full."""
-    missing = ("unseen_heat_source:flat", "step_event")
-    effects = [effect_of(name, 0.4, 23018) for name in missing]
-    found = close_loop(readings_of(*effects, seed=23018), DECLARED, effects=_few("unseen_heat_source", "step_event"))
-    assert [step.effect for step in found.steps] == ["unseen_heat_source", "step_event"]
-    assert [step.confirmed for step in found.steps] == [True, True]
-    assert found.rmse_final_um > 1.1 * found.noise_floor_um
-    assert found.verdict == "explained"
 
 
 def test_a_declared_effect_has_the_prior_of_the_library():

@@ -193,24 +193,6 @@ def test_coefficients_are_told_with_their_prior():
     assert [entry.effect for entry in declared_coefficients(fitted(), 2)] == ["axis_expansion", "step_event"]
 
 
-def test_most_of_a_smooth_drift_that_resembles_an_effect_is_in_its_uncertainty():
-    """A drift that settles like the square root of time beside an effect that approaches its end exponentially, ten noises."""
-    warm = 1.0 - np.exp(-BARE.seconds / 600.0)
-    settling = np.sqrt(BARE.seconds / BARE.seconds.max())
-    beyond, beyond_before, clean_u, moved_u = 0, 0, [], []
-    for seed in range(10):
-        noise = 0.05 * np.random.default_rng(seed).standard_normal(BARE.seconds.size)
-        for drift, u in ((0.0, clean_u), (1.0, moved_u)):
-            model = fit_model(replace(BARE, response=2.0 * warm + drift * settling + noise), [term(warm)])
-            averaged = average_over_drifts(model).fit
-            u.append(averaged.coefficients_u[-1])
-            beyond += drift * (abs(averaged.coefficients[-1] - 2.0) > 2.0 * u[-1])
-            beyond_before += drift * (abs(model.fit.coefficients[-1] - 2.0) > 2.0 * model.fit.coefficients_u[-1])
-    # Of 60 noises 0.18 lie beyond (all of them, by six times as much, without the average): most of such a drift is in it, not all.
-    assert beyond <= 3 < 9 < beyond_before
-    assert np.median(clean_u) < np.median(moved_u)
-
-
 def test_a_step_is_reported_with_its_errors_rivals_and_cycle():
     model = fitted()
     (step,) = report_steps(state(model), {}, [None])
@@ -329,12 +311,6 @@ def test_what_is_larger_than_the_drift_itself_counterbalances_another_effect():
     model = model_of(replace(measured(), response=40.0 * WAVE - 40.0 * other), [term(WAVE), term(other, "a")])
     (step,) = report_steps(state(model), {}, [Answer(0.9, 0.2, 100)])
     assert step.withheld.endswith("it counterbalances another effect") and "exceed the whole drift of" in step.withheld
-
-
-def test_a_pattern_that_all_cycles_contradict_is_not_confirmed():
-    wrong = Decision("step_event", Reason.INCONSISTENT_PATTERN, {"p_value": 1e-5})
-    (step,) = report_steps(state(fitted()), {0: wrong}, [None])
-    assert not step.confirmed and step.doubt == wrong.sentence
 
 
 def test_an_effect_that_entered_late_has_no_held_out_error():
@@ -475,27 +451,6 @@ def test_every_plain_prediction_is_of_its_kind():
     assert np.sqrt(np.mean(errors["ridge"] ** 2)) < 0.05
 
 
-def test_a_lagged_copy_predicts_what_follows_late():
-    def course(seconds):
-        return (seconds // 2400.0 % 2.0).astype(float)
-
-    def late(bare):
-        samples = np.arange(0.0, bare.seconds[-1] + 60.0, 60.0)
-        return bare.at(Series(samples, course(samples), "1").lagged(1200.0))
-
-    readings, used = with_series(course, late)
-    rms = {name: float(np.sqrt(np.mean(missed[~used] ** 2))) for name, missed in plain_errors(readings, used).items()}
-    assert rms["ridge_with_lags"] < 0.5 * rms["ridge"]
-
-
-def test_without_anything_logged_a_regression_is_the_mean():
-    bare = campaign(cycles=30)
-    readings = replace(bare, series={}, response=bare.seconds / 1e4)
-    errors = plain_errors(readings, readings.cycle <= 24)
-    for name in ("least_squares", "ridge", "ridge_with_lags"):
-        np.testing.assert_allclose(errors[name], errors["mean"])
-
-
 def test_a_site_that_was_not_read_before_has_no_prediction():
     readings, used = with_series(np.sin, lambda bare: bare.seconds / 1e4)
     used = used & (readings.site != 3)
@@ -577,22 +532,6 @@ def test_of_an_event_only_the_block_around_it_counts():
     errors = cross_errors(model, at)
     assert np.isnan(errors[~block]).all()
     np.testing.assert_allclose(errors[block], dense_errors(model, block), rtol=1e-4, atol=1e-6)
-
-
-def test_the_first_block_is_not_asked_for_what_it_alone_knows():
-    """What the machine still remembers of the time before the log dies away within the first cycles."""
-    start = np.exp(-LONG.seconds / 60.0)
-    model = predicted(5.0 * start, start)
-    assert cross_rmse(model) < 0.2
-
-
-@pytest.mark.parametrize("cycle", [3, 11, 19])
-def test_a_step_is_not_interpolated(cycle):
-    """Between the readings before and after it a drift makes a ramp: the error without the step exceeds that with it by far."""
-    at = float(LONG.seconds[LONG.cycle == cycle].min())
-    step = (LONG.seconds >= at).astype(float)
-    with_it, without = predicted(2.0 * step, step), predicted(2.0 * step)
-    assert cross_rmse(with_it, at) < 0.2 < 0.5 < cross_rmse(without, at)
 
 
 def test_a_site_that_only_one_block_holds_is_left_out():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -160,20 +159,6 @@ def test_however_many_readings_are_simulated_together_the_same_campaigns_come(mo
     whole = simulate_null(fit, np.random.default_rng(7), draws=4)
     monkeypatch.setattr("fusion.analysis.drift_model.null_simulation._READINGS_AT_ONCE", 7)
     np.testing.assert_array_equal(simulate_null(fit, np.random.default_rng(7), draws=4), whole)
-
-
-def test_simulating_a_long_test_takes_little_more_memory_than_its_readings(monkeypatch):
-    """Four matrices of all readings would fill the memory at 10,000 cycles."""
-    monkeypatch.setattr("fusion.analysis.drift_model.null_simulation._READINGS_AT_ONCE", 100)
-    fit, rng = quiet_fit(np.random.default_rng(5).standard_normal(2000), order=2), np.random.default_rng(7)
-    tracemalloc.start()
-    try:
-        draws = simulate_null(fit, rng, draws=200)
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    # Of 3.2 MB a tenth in some blocks, and the matrices of the fit; two of all readings were 2.0 times.
-    assert peak < 1.5 * draws.nbytes
 
 
 def test_simulated_noise_has_the_memory_of_the_fit(rng):

@@ -24,7 +24,6 @@ from fusion.analysis.drift_model.record import (
     channel_gains,
     declare,
     fit_record,
-    hold_out,
     needs_of,
     one_switching_share,
     record_library,
@@ -35,7 +34,7 @@ from fusion.analysis.drift_model.search import WITHHELD, Confirmed, Decision, Re
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
 from fusion.analysis.effects.library import LIBRARY, library
 from fusion.twin.recipe import EffectRecipe
-from tests.fusion.record_tables import SPINDLE, record_of, searched, spindle_table, twin_table
+from tests.fusion.record_tables import SPINDLE, record_of, searched, spindle_table
 
 pytestmark = pytest.mark.long
 
@@ -58,21 +57,6 @@ def test_one_missing_effect_is_named_and_predicts(name, size_um, parameters):
         assert candidate.parameters["period_min"] == pytest.approx(37.0, rel=0.01)
     if name == "step_event":
         assert candidate.parameters["time_s"] / 3600.0 == pytest.approx(10.4, abs=0.6)  # within the eleventh hour
-
-
-def test_a_user_effect_sees_the_record_as_readings():
-    def candidates(readings, coefficients, near):
-        door = ((readings.seconds / 3600.0) % 7.0 < 2.0).astype(float)
-        yield Candidate(door[:, None], {}, ("um",))
-
-    own = Effect("door", "an open door", "seen", candidates)
-    table = twin_table(seed=46)
-    hours = np.arange(table.sizes["time"]) / 60.0
-    table["displacement"] = table["displacement"] + ((hours % 7.0 < 2.0) * 2.0)[:, None]
-    record = reduce_record(table)
-    train, _ = hold_out(record)
-    _, state = search_record(record, train, declare(["quasi_static"], record), effects={**library(), "door": own})
-    assert "door" in [step.effect for step in state.steps]
 
 
 @pytest.mark.real_data
@@ -132,15 +116,6 @@ def test_the_start_says_what_this_record_cannot_show():
     assert told["sensor_fault"] == "the sensors are examined before the search"
     assert {effect.name for effect in LIBRARY} - set(told) == {"thermal_lag", "step_event", "periodic_disturbance"}
     assert "unseen_heat_source" not in problem_of(small(drivers=True)).start([]).not_tried()
-
-
-def test_models_are_fitted_again_to_the_same_blocks():
-    problem = problem_of(small())
-    state = problem.start([])
-    np.testing.assert_array_equal(state.model.used, TRAIN)
-    again = problem.refit(state.model, [Term("a", score().best)])
-    assert [term.effect for term in again.terms] == ["a"]
-    np.testing.assert_array_equal(again.used, TRAIN)
 
 
 @pytest.mark.parametrize(

@@ -432,11 +432,3 @@ def test_a_sensor_stays_while_later_parts_of_the_training_time_are_predicted_bet
     health = examine_record(table, ["quasi_static"])
     assert "t3" in health.table["sensor"].values
     assert [(one.sensor, one.state) for one in health.findings] in ([], [("t3", "suspected")])
-
-
-@pytest.mark.parametrize("jump_K", [1.0, 5.0, 28.0])
-def test_a_displacement_that_truly_follows_a_sensor_is_not_said_to_be_computed_with_it(jump_K):
-    table = twin_table(seed=31).isel(sensor=[1, 2, 3])
-    table["displacement"].values[:, 0] += 8.0 * (table["temperature"].values[:, 1] - 20.0)
-    table["temperature"].values[900:, 1] += jump_K
-    assert not [one for one in examine_record(table, ["quasi_static"]).findings if one.computed_with]

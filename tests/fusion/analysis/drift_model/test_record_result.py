@@ -19,7 +19,6 @@ from fusion.analysis.drift_model.record import (
     RecordResult,
     close_record,
     examine,
-    fit_record,
     hold_out,
     report_steps,
     withdraw_unreplicated,
@@ -30,7 +29,7 @@ from fusion.analysis.effects.effect import Candidate
 from fusion.results.loop import Baselines, ModelError
 from fusion.twin.recipe import EffectRecipe
 from interferometry.drift.gls import drift_system, fit_fixed_effects
-from tests.fusion.record_tables import record_of, runs_table, searched, twin_table
+from tests.fusion.record_tables import record_of, runs_table, twin_table
 
 pytestmark = pytest.mark.long
 
@@ -127,11 +126,6 @@ def predicting(of: RecordResult, **um: np.ndarray | float) -> RecordResult:
     return replace(of, predicted=predicted, hold_out_errors=errors, hold_out=told, skill_um=told["final"].rmse_um)
 
 
-def answered(of: RecordResult, answer: Answer) -> RecordResult:
-    """The same result with another answer of the hold-out set."""
-    return replace(of, steps=[step.model_copy(update=answer.described()) for step in of.steps])
-
-
 def test_the_part_of_results_json_holds_means_over_channels():
     told = result().described([])
     assert told.declared == ("quasi_static",)
@@ -201,25 +195,6 @@ def test_the_verdict_follows_from_steps_and_remainder(shape, steps, word):
     assert of.verdict == word
 
 
-def test_what_the_hold_out_set_contradicts_loses_its_name_and_what_it_cannot_tell_keeps_it():
-    struck, open_ = (answered(result(), answer) for answer in (Answer(0.1, 0.2, 50), Answer()))
-    assert struck.verdict == "unexplained" and struck.described([]).named == ()
-    assert open_.verdict == "explained" and not open_.described([]).steps[0].confirmed
-    assert [one.effect for one in open_.described([]).named] == ["unseen_heat_source"]
-
-
-def test_a_model_that_the_last_value_beats_has_no_skill():
-    assert predicting(result(), final=9.0, ridge_with_lags=8.0).verdict == "no_skill"
-
-
-def test_no_name_stands_where_a_plain_regression_is_better_by_a_quarter():
-    beaten = predicting(result(), ridge_with_lags=0.3).described([])
-    assert (beaten.verdict, beaten.separable, beaten.named) == ("unexplained", False, ())
-    # The noise is 0.2 um, three times of which may be left beside it: an error of 2 um that a regression beats is no explanation.
-    left = predicting(result(), final=2.0, ridge_with_lags=1.9).described([])
-    assert left.verdict == "partial" and left.unexplained.rms_um == pytest.approx(np.sqrt(2.0**2 - 0.2**2))
-
-
 def test_a_reading_from_time_to_time_starts_the_prediction_again():
     """What the forecast misses is a level that changes with the hold-out set: known from the first reading on."""
     rng = np.random.default_rng(4)
@@ -232,16 +207,6 @@ def test_a_reading_from_time_to_time_starts_the_prediction_again():
     # A random walk of 0.3 um from block to block, 1 to 5 blocks after the last reading; the course wanders 2 um beside it.
     assert told.model.rmse_um == pytest.approx(0.3 * np.sqrt(3.0), rel=0.3)
     assert told.last_reading.rmse_um == told.ridge.rmse_um > 2.0 * told.model.rmse_um
-
-
-def test_a_significant_effect_without_a_name_keeps_the_verdict_from_being_complete():
-    of = result()
-    lag = score("thermal_lag", excess=9.0, family_wise_p=9e-35)
-    state = replace(of.state, steps=(), errors_without_um=(), rounds=(Round((lag,)),)).decide(
-        Decision("thermal_lag", Reason.UNLOGGED_HEAT)
-    )
-    of = replace(of, state=state, steps=[])
-    assert of.verdict == "unexplained" and of.described([]).unconfirmed_effects == {"thermal_lag": 1e-3}
 
 
 def test_the_nearest_effect_is_the_strongest_of_the_last_round():
@@ -259,12 +224,6 @@ def test_the_nearest_effect_is_the_strongest_of_the_last_round():
     assert left.closest_effect == "thermal_lag" and left.rms_um == pytest.approx(np.sqrt(0.5**2 - 0.2**2))
 
 
-def test_what_a_step_without_a_name_describes_is_left_too():
-    of = result()
-    nameless = replace(of, steps=[step.model_copy(update={"withheld": "its period is open"}) for step in of.steps])
-    assert nameless.verdict == "unexplained" and nameless.unexplained.rms_um == pytest.approx(of.steps[0].rms_um)
-
-
 def test_a_result_prints_a_summary_and_draws_its_errors():
     of = result()
     assert str(of).splitlines()[:2] == ["verdict: explained", "declared: quasi_static"]
@@ -273,14 +232,6 @@ def test_a_result_prints_a_summary_and_draws_its_errors():
 
 
 # The closed loop on a record as a whole: complete models stay, and effects that did not help are withdrawn.
-
-
-def test_a_complete_model_stays_as_it_is():
-    result = close_record(reduce_record(twin_table(seed=44)), ["quasi_static"])
-    assert (result.state.steps, result.verdict) == ((), "complete")
-    told = result.described([])
-    assert told.rmse_final_um == told.rmse_declared_um
-    assert {one.effects == () for one in told.chained} == {True}
 
 
 def test_an_effect_that_fails_on_the_hold_out_set_is_contradicted_and_leaves_the_forecast():
@@ -299,20 +250,6 @@ def test_an_effect_that_fails_on_the_hold_out_set_is_contradicted_and_leaves_the
     assert step.borne_out == "no" and step.doubt.startswith("contradicted: on the hold-out set its size is ")
     assert told.left_out_of_forecast == ("periodic_disturbance",)
     assert told.verdict not in {"complete", "explained"}
-
-
-def test_an_effect_that_earlier_parts_did_not_bear_out_is_withdrawn():
-    problem, state = searched(EffectRecipe("periodic_disturbance", 0.6, parameters={"period_min": 37.0}), seed=44)
-
-    name = "periodic_disturbance"
-    helped, hurt, without = part((name,), 2.0, 1.0), part((name,), 1.0, 2.1), part((), 1.0, 1.0)
-    assert withdraw_unreplicated(problem, state, [without]) is state
-    assert withdraw_unreplicated(problem, state, [helped, without]) is state
-    kept = withdraw_unreplicated(problem, state, [helped, hurt, without])
-    assert kept.steps == ()
-    assert "the 2 earlier part(s) of the record" in kept.blocked()[name]
-    # A part that reaches into the hold-out set has no vote.
-    assert withdraw_unreplicated(problem, state, [hurt.model_copy(update={"in_training": False})]) is state
 
 
 COLUMN = Candidate(np.zeros((2, 1)), {}, ("um",))
@@ -510,12 +447,6 @@ def test_a_rhythm_is_told_with_its_period_and_is_no_course_in_time(height, perio
     assert left.p_value < 0.02
 
 
-def test_what_a_rhythm_leaves_is_told_beside_it():
-    load, kick = kicked()
-    left = examined(record_with(kick + 1.5 * np.cos(2.0 * np.pi * BLOCK / 6.0), load=load))
-    assert left.shape == "a rhythm of about 30 min and quick responses where a driver is switched"
-
-
 @pytest.mark.parametrize(
     ("errors", "words"),
     [
@@ -530,24 +461,10 @@ def test_the_channels_with_the_larger_errors_are_named(errors, words):
     assert left.shape.endswith(f"largest in {words}")
 
 
-def test_both_remainders_are_told():
-    left = examined(record_with(0.5 * np.cos(2.0 * np.pi * BLOCK / 6.0)), hold_out_rmse=5.0)
-    assert left.shape.startswith("a rhythm of about 30 min and a slow drift")
-
-
 def test_one_wild_block_makes_no_shape():
     wild = np.zeros(BLOCKS)
     wild[100] = 500.0
     assert examined(record_with(wild)).shape == ""
-
-
-def test_blocks_without_a_value_are_no_shape(rng):
-    record = record_with(0.5 * np.cos(2.0 * np.pi * BLOCK / 6.0))
-    holed = record.displacement.copy()
-    holed[50:60, 0] = np.nan
-    assert examined(replace(record, displacement=holed)).shape == "a rhythm of about 30 min"
-    model = fit_record(record, [], np.ones(BLOCKS, bool))
-    assert examine(model, np.zeros(2), np.zeros(2), rng).p_values["periodicity"] < 0.02
 
 
 def test_statistics_of_a_wave_that_is_known():

@@ -239,15 +239,6 @@ def test_an_event_is_in_the_fit_and_not_in_the_recursion(stepped):
     assert {one.name for one in model.inputs} <= {*record.sensors, *record.drivers}
 
 
-def test_a_displacement_that_a_part_does_not_hold_takes_no_part_there(stepped):
-    record, product, loop = stepped
-    empty = product.copy(deep=True)
-    part = product["part"].values == product["part"].values[record.seconds.size // 3]
-    empty["displacement"].values[part, 1] = np.nan
-    model = make_recursion(empty, loop, sampling_s=record.block_s, reduced=True, **FROM)
-    assert model.sensor_curve and all(np.isfinite(one.cross_rmse) for one in model.sensor_curve)
-
-
 @pytest.mark.parametrize("block_h", [3.0, 8.0, 30.0])
 def test_a_longer_test_leaves_less_open_also_where_the_record_has_long_blocks(block_h):
     """A year of a load that rests and works for days, followed by its displacement and by a sensor."""
@@ -288,13 +279,6 @@ def test_a_next_test_leaves_less_open_and_says_what_is_open_now(driven):
     assert min(tests[0].open_um.values()) > 0.0
     with pytest.raises(DutyPlanError, match="log speed, load or duty"):
         next(propose_tests(product.isel(driver_name=slice(0)), loop.model_copy(update={"steps": ()})))
-
-
-def test_of_several_runs_the_uncertainty_is_that_of_all_of_them_and_no_more():
-    """A second run of half the length: to predict either from the other alone says nothing of both."""
-    _, product, loop = run_of(runs_table(5.0, -3.0))
-    (output,) = make_recursion(product, loop, sampling_s=60.0, **FROM).outputs
-    assert output.u < 0.01
 
 
 def wandering_record(rng: np.random.Generator, blocks: int = 200, *, follows: float = 2.0) -> Record:
