@@ -1,7 +1,5 @@
 """The joint estimate: against the plain mean, simulated truth, turbulent air and shapes that the readings add."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -207,27 +205,6 @@ def test_many_targets_give_the_same_on_any_number_of_threads(rng):
         with threadpool_limits(threads, user_api="blas"):
             estimated.append(estimate_drift(test))
     xr.testing.assert_identical(*estimated)
-
-
-def test_memory_grows_with_the_readings_and_not_with_the_targets(rng, monkeypatch):
-    monkeypatch.setattr("interferometry.drift.gls._SHARED_VALUES", 2**16)
-    peaks = []
-    for cycles, targets in ((24, 40), (6, 160)):
-        seconds = 5.0 * np.arange(2.0 * cycles * targets).reshape(cycles, 2, targets)
-        seconds[:, 1] = seconds[:, 1, ::-1]
-        time = np.datetime64("2026-03-09T06:30", "ns") + (1e9 * seconds).astype("timedelta64[ns]")
-        drift = np.cumsum(rng.normal(0, 0.02, seconds.size))[np.argsort(np.argsort(seconds, axis=None))]
-        deviation = drift.reshape(seconds.shape) + rng.normal(0, 0.3, seconds.shape)
-        test = build_deviations(
-            range(1, cycles + 1), range(1, targets + 1), np.linspace(0.0, 1000.0, targets), deviation, time
-        )
-        tracemalloc.start()
-        estimate_drift(test, order=1, components=("shift", "stretch"))
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    # The readings are as many in both; what held a column for each position and approach would take four times as much, and the
-    # covariance of the profile with itself grows.
-    assert peaks[1] < 1.8 * peaks[0]
 
 
 def with_walk(rng: np.random.Generator, *, cycles: int, sigma: float, between_um: float) -> xr.Dataset:

@@ -57,16 +57,6 @@ def test_settling_of_one_known_time_constant(rng):
     assert shift.amplitude_um == pytest.approx(8.0, rel=0.05)
 
 
-@pytest.mark.slow
-def test_a_shape_that_the_readings_add_settles_with_the_others(rng):
-    deviations, truth = simulate(rng, kind="warmup")
-    zone = 10.0 * (1.0 - np.exp(-truth.seconds / 5400.0)) * np.minimum(truth.position, 0.55) / 0.55
-    deviations["deviation"] = deviations["deviation"] + zone
-    settling = {one.component: one for one in estimate_settling(deviations, estimate_drift(deviations))}
-    # The zone settles with 5,400 s; noise of 0.4 um leaves its time constant known to some 10 %.
-    assert settling["shape_1"].t63_s == pytest.approx(5400.0, rel=0.3)
-
-
 def test_a_stable_machine_has_nothing_to_settle(rng):
     deviations, _ = simulate(rng, kind="none")
     assert estimate_settling(deviations, estimate_drift(deviations)) == []

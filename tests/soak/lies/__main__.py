@@ -1,7 +1,7 @@
 """Run lies through the command's pipeline and print what it answers.
 
-``python -m tests.soak.lies --out lies.jsonl`` goes on where an interrupted run stopped; ``--again PATTERN`` repeats rows; the table and
-the counts are printed at the end. ``--campaign``, ``--only PATTERN`` and ``--processes`` choose what is run.
+``python -m tests.soak.lies --out lies.jsonl`` goes on where an interrupted run stopped; ``--again PATTERN`` repeats rows; the counts are
+printed at the end. ``--campaign``, ``--only PATTERN`` and ``--processes`` choose what is run.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 from tests.soak.lies.campaigns import RECIPES
-from tests.soak.lies.runs import counts_table, coverage_table, read_rows, rows_table, run_all
+from tests.soak.lies.runs import counts_table, read_rows, run_all
 
 
 def main() -> None:
@@ -35,7 +35,7 @@ def main() -> None:
         say=lambda text: print(text, flush=True),
     )
     rows = [row for row in read_rows(options.out) if row.campaign in campaigns]
-    print(f"\n{rows_table(rows)}\n\n{counts_table(rows)}\n\n{coverage_table(rows)}")
+    print(f"\n{counts_table(rows)}")
 
 
 if __name__ == "__main__":

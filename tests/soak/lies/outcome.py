@@ -64,7 +64,7 @@ def judge(lie: Lie, truth: Truth, results: Results, folder: Path) -> tuple[Outco
     return (Outcome.CORRECTED if any(_names(lie, notice) for notice in notices) else Outcome.RIGHT), wrong
 
 
-def shares_within(truth: Truth, results: Results, folder: Path, *, renumbered: int = 0) -> dict[str, float]:
+def shares_within(truth: Truth, results: Results, folder: Path) -> dict[str, float]:
     """Share of the values of each figure whose error is at most twice its printed standard uncertainty."""
     shares = {}
     loop = results.loop
@@ -81,7 +81,7 @@ def shares_within(truth: Truth, results: Results, folder: Path, *, renumbered: i
         true = truth.readings["mean_profile"].values
         if estimate.shape == true.shape:
             shares["profile"] = _share(_line_left_out(estimate - true), u)
-    for name, error, u in _field_errors(truth, folder / "fields.nc", renumbered):
+    for name, error, u in _field_errors(truth, folder / "fields.nc", 0):
         shares[name] = _share(error, u)
     return shares
 

@@ -1,4 +1,4 @@
-"""Runs of the pipeline on lying inputs, kept as JSON lines so that an interrupted soak goes on, and their tables."""
+"""Runs of the pipeline on lying inputs, kept as JSON lines so that an interrupted soak goes on, and their counts."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import re
 import tempfile
 import time
 import traceback
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from unittest import mock
@@ -24,7 +24,7 @@ from fusion.results.results import Results
 from interferometry.common import InterferometryError
 from tests.soak.lies.campaigns import RECIPES, write
 from tests.soak.lies.catalogue import GROUPS, LIES
-from tests.soak.lies.outcome import Outcome, judge, refusal, shares_within
+from tests.soak.lies.outcome import Outcome, judge, refusal
 from thermography.common import ThermographyError
 
 #: Longest part of a message that a row keeps.
@@ -48,8 +48,6 @@ class Row:
         The refusal, the end of the traceback, or the verdict with its causes.
     seconds : float
         Time of the run, s.
-    within : dict of str to float
-        Share of each figure's values whose error is at most twice its printed uncertainty.
     """
 
     campaign: str
@@ -60,7 +58,6 @@ class Row:
     said: tuple[str, ...]
     message: str
     seconds: float
-    within: dict[str, float] = field(default_factory=dict)
 
 
 def run_one(campaign: str, group: str, name: str, figures: bool) -> Row:
@@ -74,18 +71,16 @@ def run_one(campaign: str, group: str, name: str, figures: bool) -> Row:
             stack.enter_context(mock.patch("fusion.report.page.render_report", return_value=""))
         wrong: list[str] = []
         said: tuple[str, ...] = ()
-        within: dict[str, float] = {}
         try:
             results = run_campaign(folder / "campaign.toml", out)
             outcome, wrong = judge(lie, truth, results, out)
             said, message = tuple(_said(results)), _verdict(results)
-            within = shares_within(truth, results, out, renumbered=lie.renumbered)
         except (FusionError, ThermographyError, InterferometryError) as error:
             message = f"{type(error).__name__}: {error}".replace(base, "")
             outcome = refusal(lie, message)
         except Exception:
             outcome, message = Outcome.TRACEBACK, traceback.format_exc()[-_MESSAGE:]
-    return Row(campaign, group, name, outcome, tuple(wrong), said, message[:_MESSAGE], time.monotonic() - begun, within)
+    return Row(campaign, group, name, outcome, tuple(wrong), said, message[:_MESSAGE], time.monotonic() - begun)
 
 
 def _said(results: Results) -> Iterator[str]:
@@ -155,31 +150,6 @@ def read_rows(path: Path) -> list[Row]:
     return sorted(rows.values(), key=lambda row: (order[row.lie], [*RECIPES].index(row.campaign)))
 
 
-def rows_table(rows: Sequence[Row]) -> str:
-    """A markdown table: one line per lie, one column per campaign."""
-    campaigns = [name for name in RECIPES if any(row.campaign == name for row in rows)]
-    by_lie: dict[str, dict[str, Row]] = defaultdict(dict)
-    for row in rows:
-        by_lie[row.lie][row.campaign] = row
-    lines = [f"| group | lie | {' | '.join(campaigns)} |", "|---|---|" + "---|" * len(campaigns)]
-    for name, found in by_lie.items():
-        cells = [_cell(found[campaign]) if campaign in found else "" for campaign in campaigns]
-        group = next(iter(found.values())).group
-        lines.append(f"| {group} | {name}{' (declared limit)' if LIES[name].limit else ''} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _cell(row: Row) -> str:
-    """One outcome with what is wrong, or with what was said."""
-    told = {
-        Outcome.SILENTLY_WRONG: "; ".join((*row.wrong, *(f"({code})" for code in row.said))),
-        Outcome.TRACEBACK: row.message.strip().splitlines()[-1] if row.message.strip() else "",
-        Outcome.REFUSED: row.message[:140],
-        Outcome.REFUSED_NAMED: row.message[:140],
-    }.get(row.outcome, ", ".join(code for code in row.said if code.startswith("doubt_")))
-    return f"**{row.outcome}** {told}".strip().replace("|", "/").replace("\n", " ")
-
-
 def counts_table(rows: Sequence[Row]) -> str:
     """A markdown table: how many lies led to each outcome; undisturbed campaigns, sound ones and declared limits apart."""
     campaigns = [name for name in RECIPES if any(row.campaign == name for row in rows)]
@@ -193,15 +163,4 @@ def counts_table(rows: Sequence[Row]) -> str:
     lines.append(f"| lies | {' | '.join(map(str, each))} | {sum(each)} |")
     limits = [sum(row.campaign == campaign and bool(LIES[row.lie].limit) for row in rows) for campaign in campaigns]
     lines.append(f"| declared limits, not counted | {' | '.join(map(str, limits))} | {sum(limits)} |")
-    return "\n".join(lines)
-
-
-def coverage_table(rows: Sequence[Row]) -> str:
-    """A markdown table: share of the values within twice their printed uncertainty, over the runs that nothing doubts."""
-    sound = [row for row in rows if row.within and not any(code.startswith("doubt_") for code in row.said)]
-    figures = sorted({name for row in sound for name in row.within})
-    lines = ["| figure | within 2 u | runs |", "|---|---|---|"]
-    for name in figures:
-        shares = [row.within[name] for row in sound if np.isfinite(row.within.get(name, np.nan))]
-        lines.append(f"| {name} | {np.mean(shares):.3f} | {len(shares)} |")
     return "\n".join(lines)

@@ -86,46 +86,16 @@ def hot(frame: FrameReference) -> FrameReference:
 
 
 @pytest.mark.parametrize(
-    ("change", "first", "overridden", "expected"),
+    ("change", "first", "overridden", "code"),
     [
-        (
-            lambda frame: with_parameters(frame, emissivity=0.7),
-            3,
-            set(),
-            {
-                "camera_settings": "Parameters differ between the frames: emissivity (0.7 to 0.97). "
-                "The emissivity of the first frame is used for all."
-            },
-        ),
-        (lambda frame: with_parameters(frame, emissivity=0.7), 3, STATED, {}),
-        (hot, 3, STATED, {"camera_settings": "The camera's range changes (2 ranges)."}),
-        (
-            hot,
-            0,
-            STATED,
-            {
-                "camera_range": "Up to 100 % of the pixels of a frame are outside the range in which the camera is calibrated."
-            },
-        ),
-        (
-            lambda frame: with_camera(frame, lens_model="FOL76"),
-            3,
-            STATED,
-            {"camera_settings": "The frames were taken through 2 lenses."},
-        ),
-        (
-            lambda frame: with_camera(frame, serial="other"),
-            3,
-            STATED,
-            {"camera_settings": "The file holds frames of 2 cameras."},
-        ),
-        (
-            lambda frame: with_parameters(frame, reflected_temperature_K=571.15),
-            0,
-            set(),
-            {"camera_parameters": "Reflected temperature 298 degC: probably K stored as degC."},
-        ),
-        (lambda frame: with_parameters(frame, reflected_temperature_K=571.15), 0, STATED, {}),
+        (lambda frame: with_parameters(frame, emissivity=0.7), 3, set(), "camera_settings"),
+        (lambda frame: with_parameters(frame, emissivity=0.7), 3, STATED, None),
+        (hot, 3, STATED, "camera_settings"),
+        (hot, 0, STATED, "camera_range"),
+        (lambda frame: with_camera(frame, lens_model="FOL76"), 3, STATED, "camera_settings"),
+        (lambda frame: with_camera(frame, serial="other"), 3, STATED, "camera_settings"),
+        (lambda frame: with_parameters(frame, reflected_temperature_K=571.15), 0, set(), "camera_parameters"),
+        (lambda frame: with_parameters(frame, reflected_temperature_K=571.15), 0, STATED, None),
     ],
 )
 def test_what_changes_from_a_frame_on_or_is_implausible_is_doubted_unless_it_is_stated(
@@ -133,10 +103,10 @@ def test_what_changes_from_a_frame_on_or_is_implausible_is_doubted_unless_it_is_
     change: Callable[[FrameReference], FrameReference],
     first: int,
     overridden: set[str],
-    expected: dict[str, str],
+    code: str | None,
 ) -> None:
     found = failed([*frames[:first], *map(change, frames[first:])], overridden)
-    assert {code: found[code] for code in expected} == expected and bool(found) == bool(expected)
+    assert code in found if code else not found
 
 
 # Consistency checks of the camera's stamps: order, rate of its clock, place in the motion of the axis.

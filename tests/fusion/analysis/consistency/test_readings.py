@@ -88,7 +88,7 @@ def test_sound_tests_of_other_machines_pass(
     noise_um: float,
     rounding_um: float,
 ) -> None:
-    for seed in range(5):
+    for seed in range(2):
         rng, share = np.random.default_rng([seed, 3]), np.linspace(0.0, 1.0, targets)
         drift = 2.0 * noise_um * (1.0 - np.exp(-3.0 * np.arange(cycles) / cycles))
         values = slope_um * (1.5 - 0.5 * share) * share + drift[:, None, None] * (0.5 + 0.5 * share)

@@ -33,30 +33,9 @@ from fusion.analysis.drift_model.record_data import Record, RecordedRun, reduce_
 from fusion.analysis.drift_model.search import WITHHELD, Confirmed, Decision, Reason, Round, Score
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
 from fusion.analysis.effects.library import LIBRARY, library
-from fusion.twin.recipe import EffectRecipe
-from tests.fusion.record_tables import SPINDLE, record_of, searched, spindle_table
+from tests.fusion.record_tables import SPINDLE, record_of, spindle_table
 
 pytestmark = pytest.mark.long
-
-
-@pytest.mark.parametrize(
-    ("name", "size_um", "parameters"),
-    [
-        ("unseen_heat_source", 1.5, {}),
-        ("step_event", 1.0, {"at_cycle": 11}),
-        ("periodic_disturbance", 0.6, {"period_min": 37.0}),
-    ],
-)
-def test_one_missing_effect_is_named_and_predicts(name, size_um, parameters):
-    problem, state = searched(EffectRecipe(name, size_um, parameters=parameters), seed=44)
-    assert [step.effect for step in state.steps] == [name]
-    assert problem.hold_out_error(state.model.terms) < problem.hold_out_error(state.declared)
-    candidate = state.model.terms[-1].candidate
-    if name == "periodic_disturbance":
-        # The training part holds 31 periods, whose number is known to a small part of one.
-        assert candidate.parameters["period_min"] == pytest.approx(37.0, rel=0.01)
-    if name == "step_event":
-        assert candidate.parameters["time_s"] / 3600.0 == pytest.approx(10.4, abs=0.6)  # within the eleventh hour
 
 
 @pytest.mark.real_data
