@@ -160,52 +160,6 @@ def _of(log: xr.Dataset, **columns: np.ndarray) -> xr.Dataset:
     return log.assign({name: log[name].copy(data=values) for name, values in columns.items()})
 
 
-def _material(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recorded], Recorded]:
-    """A lie of the material temperature."""
-
-    def lied(test: Recorded) -> Recorded:
-        changed = change(test.environment["material_temperature"].values)
-        return replace(test, environment=_of(test.environment, material_temperature=changed))
-
-    return lied
-
-
-def _exchanged(test: Recorded) -> Recorded:
-    air, material = (test.environment[f"{name}_temperature"].values for name in ("air", "material"))
-    return replace(test, environment=_of(test.environment, material_temperature=air, air_temperature=material))
-
-
-def _per_cent(test: Recorded) -> Recorded:
-    duty = test.drivers["duty"].values
-    late_half = np.arange(duty.size) >= duty.size // 2
-    return replace(test, drivers=_of(test.drivers, duty=duty * np.where(late_half, 100.0, 1.0)))
-
-
-LYING_LOGS: dict[str, Callable[[Recorded], Recorded]] = {
-    "backwards": _material(lambda values: values[::-1]),
-    "another hour": _material(lambda values: np.roll(values, -60)),
-    "stands still": _material(lambda values: np.full(values.size, values[0])),
-    "exchanged": _exchanged,
-    "per cent": _per_cent,
-}
-
-
-@pytest.mark.parametrize("lie", LYING_LOGS)
-def test_lying_logs(lie: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The place of the sensor stated, and not; what is noticed, and by which checks."""
-    runs, noticed, codes = campaigns(40), Counter[bool](), Counter[str]()
-    for seed in range(first_seed(58000), first_seed(58000) + runs):
-        test = LYING_LOGS[lie](record(Recipe().vary(campaign={"seed": seed}, duty={"mean_hold_min": 25.0})))
-        for stated in (True, False):
-            failed = {check.code for check in of_logs(test, stated=stated) if not check.passed}
-            noticed[stated] += bool(failed)
-            codes.update(failed if stated else ())
-    with capsys.disabled():
-        print(
-            f"\nlog {lie}: noticed with the sensor's place {rate(noticed[True], runs)}, without {rate(noticed[False], runs)}; {dict(codes)}"
-        )
-
-
 LYING_LOADS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "as it is": lambda duty: duty,
     "inverted": lambda duty: 1.0 - duty,

@@ -98,15 +98,18 @@ def test_the_course_of_a_patch_without_noise_is_exact():
 
 
 def test_frames_of_a_long_test_are_never_held_in_double_precision(monkeypatch):
-    monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 256 * 8 * 10 * 20)
-    frames = np.random.default_rng(4).standard_normal((6000, 10, 20)).astype(np.float32)
+    monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 64 * 8 * 10 * 20)
+    monkeypatch.setattr("fusion.analysis.alignment.reflections._MOST_CHANGES", 250)
+    frames = np.random.default_rng(4).standard_normal((1500, 10, 20)).astype(np.float32)
+    # What is imported at the first call is none of the frames.
+    find_switching_patch(frames[:40])
     tracemalloc.start()
     try:
         find_switching_patch(frames)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    # A thousand changes in double precision and a block; all of them took ten times the frames.
+    # 250 changes in double precision and a block; all of them took ten times the frames.
     assert peak < 1.5 * frames.nbytes
 
 
