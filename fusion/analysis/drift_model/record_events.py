@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import linalg, optimize, stats
+from scipy import linalg, optimize, special
 
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.drift_model.evaluation import Answer
@@ -340,7 +340,7 @@ class _Cells:
         here = turns[np.clip(at, 0, len(turns) - 1)]
         # Where nothing is known, nothing turns.
         rank = [np.where(np.isnan(one), 1.0, np.nanmean(turns >= one, axis=0)) for one in here]
-        p = stats.chi2.sf(-2.0 * np.log(rank).sum(axis=0), 2 * len(times)) * len(self.names)
+        p = special.chdtrc(2 * len(times), -2.0 * np.log(rank).sum(axis=0)) * len(self.names)
         return float(p.min()), self.names[int(p.argmin())]
 
     def ignore(self, seen: _Seen, channels: slice | int) -> None:
