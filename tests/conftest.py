@@ -71,8 +71,15 @@ def real_file():
     return find
 
 
+#: Makes the whole runs that tests of other files look at.
+_FIRST = "test_any_subset.py"
+
+
 def pytest_collection_modifyitems(config, items):
-    """Mark what reads the results of a whole run, starts the application or opens a browser; workers begin with the long files."""
+    """Mark what reads the results of a whole run, starts the application or opens a browser; short files come last.
+
+    One worker begins with the whole runs, the others with long files that need none and so wait for none.
+    """
     for item in items:
         fixtures = set(getattr(item, "fixturenames", ()))
         if fixtures & {"results_folder", "app", "states", "sound", "record_results"}:
@@ -80,7 +87,12 @@ def pytest_collection_modifyitems(config, items):
         if fixtures & {"new_page", "opened"}:
             item.add_marker("browser")
     if hasattr(config, "workerinput"):
-        long = {
-            item.path for item in items if {mark.name for mark in item.iter_markers()} & {"long", "chain", "browser"}
-        }
-        items.sort(key=lambda item: (item.path not in long, item.path))
+        marks = {}
+        for item in items:
+            marks.setdefault(item.path, set()).update(mark.name for mark in item.iter_markers())
+
+        def turn(path):
+            chained = bool(marks[path] & {"chain", "browser"})
+            return path.name != _FIRST, not (chained or "long" in marks[path]), chained
+
+        items.sort(key=lambda item: (*turn(item.path), item.path))

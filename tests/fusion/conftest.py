@@ -79,7 +79,7 @@ def kept(pytestconfig: pytest.Config) -> Callable[[str, Callable[[Path], object]
     """Return a function that fills a folder once for all workers, and for later calls of a day while no source changes."""
     digest = sha256((sys.version + (pytestconfig.rootpath / "constraints.txt").read_text(encoding="utf-8")).encode())
     for path in sorted(each for source in _SOURCES for each in (pytestconfig.rootpath / source).rglob("*.*")):
-        if path.is_file() and "__pycache__" not in path.parts:
+        if path.is_file() and "__pycache__" not in path.parts and not path.name.startswith("test_"):
             digest.update(str(path.relative_to(pytestconfig.rootpath)).encode() + path.read_bytes())
     base = pytestconfig.rootpath / "build" / "kept"
     root = base / digest.hexdigest()

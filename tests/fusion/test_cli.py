@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from importlib import metadata
 from pathlib import Path
 
 import jsonschema
@@ -204,19 +203,17 @@ def test_iso230_evaluates_a_window(campaign_folder: Path, tmp_path: Path) -> Non
     assert refused.exit_code == 2 and '--cycles "one": this is not a window of cycles' in refused.stderr
 
 
-@pytest.mark.parametrize("encoding", ["cp850", "utf-8"])
-def test_json_is_json_in_any_encoding(tmp_path: Path, encoding: str) -> None:
+def test_json_is_json_in_any_encoding(tmp_path: Path) -> None:
     """A pipe of another encoding than UTF-8 cannot take every character, and JSON has its own way to write them."""
     name = "µ €\U0001d6b9.csv"
     (tmp_path / name).write_text("no table")
-    done = subprocess.run(
-        [sys.executable, "-m", "thermofuse", "inspect", str(tmp_path / name), "--json"],
-        capture_output=True,
-        env=os.environ | {"PYTHONIOENCODING": encoding},
-        check=False,
-    )
-    assert Path(json.loads(done.stdout.decode(encoding))["files"][0]["file"]).name == name
-    assert ("µ".encode() in done.stdout) == (encoding == "utf-8")
+    command = [sys.executable, "-m", "thermofuse", "inspect", str(tmp_path / name), "--json"]
+    environment = os.environ | {"PYTHONIOENCODING": "cp850"}
+    written = subprocess.run(command, capture_output=True, env=environment, check=False).stdout
+    in_unicode = invoke("inspect", tmp_path / name, "--json").stdout
+    for text in (written.decode("cp850"), in_unicode):
+        assert Path(json.loads(text)["files"][0]["file"]).name == name
+    assert "µ".encode() not in written and "µ" in in_unicode
 
 
 def test_plan_proposes_a_schedule_and_refuses_half_a_source() -> None:
@@ -314,18 +311,6 @@ def test_simulate_writes_a_campaign_once(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert result.output.rstrip().endswith(f"campaign: {tmp_path / 'campaign' / 'campaign.toml'}")
     assert invoke("simulate", recipe, "--out", tmp_path / "campaign").exit_code == 2
-
-
-def test_frames_are_exported_where_it_is_asked_for(campaign_folder: Path, tmp_path: Path) -> None:
-    frame = sorted((campaign_folder / "thermal").iterdir())[0]
-    result = invoke("inspect", frame, campaign_folder / "laser.csv", "--export", tmp_path / "out")
-    assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"{frame.name}.png", "regions.csv"]
-
-
-def test_the_version_is_printed_alone() -> None:
-    result = invoke("--version")
-    assert (result.exit_code, result.output) == (0, f"thermofuse {metadata.version('thermofuse')}\n")
 
 
 def test_a_watched_test_prints_a_line_per_cycle_and_is_then_run(

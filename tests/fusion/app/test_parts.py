@@ -82,10 +82,6 @@ def test_an_uploaded_name_is_a_name_and_nothing_else(written):
         file_name(written)
 
 
-def test_common_names_are_taken():
-    assert file_name("IR_0001 (größer).jpg") == "IR_0001 (größer).jpg"
-
-
 def test_the_report_is_sent_whole_and_in_a_sandbox(app, cookie, ask):
     address, folder = app
     answer = ask(address, report_link(folder, folder / "results"), Cookie=cookie)

@@ -149,15 +149,6 @@ def test_a_layout_gives_the_record_of_headings_written_by_hand(
     np.testing.assert_array_equal(times, expected)
 
 
-def test_a_sheet_with_lines_above_its_table_is_read_too(tmp_path: Path, by_hand: xr.Dataset) -> None:
-    sheet = [["Mill 7", "", "", ""], ["Date", "spindle", "bearing", "Z"], ["", "°C", "°C", "mm"]]
-    sheet += [list(line) for line in zip(map(str, STAMPS), SPINDLE, BEARING, NOSE, strict=True)]
-    pd.DataFrame(sheet).to_excel(tmp_path / "log.xlsx", index=False, header=False)
-    data = drafted(tmp_path / "folder", (tmp_path / "log.xlsx").read_bytes(), "log.xlsx")
-    np.testing.assert_allclose(data["temperature"].values, by_hand["temperature"].values, atol=1e-9)
-    np.testing.assert_array_equal(data["time"].values, by_hand["time"].values)
-
-
 def test_values_are_held_between_their_changes(tmp_path: Path, by_hand: xr.Dataset) -> None:
     """Lines of one channel each, a second apart, of what moved by 0.05 K or 0.5 um: the rows of the regular table within the dead bands."""
     lines, last = list[tuple[np.datetime64, str]](), dict[str, float]()
@@ -484,28 +475,11 @@ def test_days_counted_from_a_date_are_told_by_their_numbers_and_marked(
     assert [notice.code for notice in guess_notices(campaign)] == ["units_guessed"]
 
 
-def test_a_unit_of_time_that_is_not_known_is_asked(tmp_path: Path) -> None:
-    lines = [f"{k},{20 + k / 100},{k}.5" for k in range(300)]
-    (tmp_path / "log.csv").write_text("\n".join(["time [years],T1 [degC],Z [um]", *lines]) + "\n")
-    path, _ = write_campaign(tmp_path, Asker(None))
-    assert 'time_unit = "FILL IN"' in path.read_text()
-    with pytest.raises(CampaignError, match="time_unit"):
-        load_campaign(path)
-
-
 @pytest.mark.parametrize("unit", ["°C", "ºC", "˚C", "Â°C", "\ufffdC", "oC", "C°", "gradC", "° C", "℃"])
 def test_what_looks_like_the_degree_sign_is_one(tmp_path: Path, unit: str) -> None:
     lines = [f"{60 * k},{20 + k / 100},{k}.5" for k in range(100)]
     (tmp_path / "log.csv").write_text("\n".join([f"time [s],T1 [{unit}],Z [um]", *lines]) + "\n")
     assert [column.unit for column in propose_table(tmp_path / "log.csv").of("temperature")] == ["degC"]
-
-
-@pytest.mark.parametrize(("unit", "factor", "offset"), [("℉", 1.8, 32.0), ("mK", 1e3, 273150.0)])
-def test_temperatures_in_other_units_are_converted(tmp_path: Path, unit: str, factor: float, offset: float) -> None:
-    lines = [f"{60 * k},{(20 + k / 100) * factor + offset!r},{k}.5" for k in range(100)]
-    (tmp_path / "log.csv").write_text("\n".join([f"time [s],T1 [{unit}],Z [um]", *lines]) + "\n")
-    path, _ = write_campaign(tmp_path, Asker(None))
-    np.testing.assert_allclose(read_record(load_campaign(path))["temperature"].values[:, 0], 20 + np.arange(100) / 100)
 
 
 def record_of(folder: Path, text: str) -> xr.Dataset:
@@ -675,17 +649,6 @@ def test_what_only_values_tell_is_marked_and_a_name_that_says_something_else_is_
     if displacements and "furlong" not in head:
         record = load_campaign(write_campaign(tmp_path, Asker(None))[0]).record
         assert record is not None and record.guessed == guessed
-
-
-def test_a_cover_sheet_is_passed_over(tmp_path: Path, by_hand: xr.Dataset) -> None:
-    book = openpyxl.Workbook()
-    book.active.append(["Machine", "Mill 7"])
-    sheet = book.create_sheet("Data")
-    for row in [("Date", "T1 [°C]", "T2 [°C]", "Z [mm]"), *zip(map(str, STAMPS), SPINDLE, BEARING, NOSE, strict=True)]:
-        sheet.append([one if isinstance(one, str) else float(one) for one in row])
-    book.save(tmp_path / "log.xlsx")
-    data = drafted(tmp_path / "folder", (tmp_path / "log.xlsx").read_bytes(), "log.xlsx")
-    np.testing.assert_allclose(data["displacement"].values, by_hand["displacement"].values, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -16,14 +16,11 @@ from fusion.campaign.inputs import (
     Source,
     SourceError,
     cycles_of_frames,
-    frames_notices,
     read_source,
     stack_options,
     usual_window_s,
-    window_notice,
 )
 from fusion.pipeline.positioning import evaluate_interferometry
-from fusion.results.axis import RejectedFrame
 from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
 from tests.fusion.campaign_parts import change, keep_cycles, without
@@ -81,13 +78,6 @@ def test_a_single_frame_is_enough_for_a_camera_alone(copied: Path) -> None:
         read_source(load_campaign(copied / "campaign.toml"))
 
 
-def test_windows_shorter_than_a_minute_are_told_in_seconds(copied: Path) -> None:
-    path = without(copied / "campaign.toml", "interferometry", "plan.axis", "model", "drivers", name="camera.toml")
-    change(path, 'table = "still"', 'window = "40 s"\ntable = "still"')
-    notice = window_notice(read_source(load_campaign(path)))
-    assert "windows of 40 s, as" in notice.message
-
-
 def test_a_short_test_is_refused_before_the_long_work(copied: Path) -> None:
     keep_cycles(copied / "laser.csv", 1)
     with pytest.raises(
@@ -116,15 +106,6 @@ def test_a_region_that_cannot_be_used_is_refused(copied: Path, corners: str, kno
     path.write_text(path.read_text() + f'\n[[thermography.region]]\nname = "chuck"\nrectangle = [{corners}]\n{known}\n')
     with pytest.raises(SourceError, match=message):
         read_source(load_campaign(path))
-
-
-def test_a_frame_of_another_size_is_not_called_damaged() -> None:
-    why = "FLIR E40 7, 160 x 120, taken 2012-11-21T10:00:00Z, among frames of FLIR T1020 9, 320 x 240"
-    other = RejectedFrame(file="b.seq", index=0, reason=why)
-    (notice,) = frames_notices([other])
-    assert notice.remedy == "Name the frames of one camera and one size only in thermography.frames."
-    (notice,) = frames_notices([other, RejectedFrame(file="c.seq", index=0, reason="c.seq: cut off")])
-    assert notice.remedy.startswith("Copy damaged files again")
 
 
 def test_frames_of_another_camera_are_the_odd_ones_out(copied: Path) -> None:

@@ -24,7 +24,7 @@ from fusion.campaign.inspect import (
     time_bars,
     write_frames,
 )
-from fusion.campaign.values import FILE_KEYS, column_unit, is_time
+from fusion.campaign.values import FILE_KEYS
 from interferometry.io.faults import LaserFormatError
 from interferometry.io.readings import FILES, TABLES, read_deviations
 from interferometry.io.writers import write_rtl
@@ -38,13 +38,6 @@ from thermography.io.flir import FlirReader
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CameraIdentity
 from thermography.io.other_cameras import StackContents, StackOptions, TemperatureReader, find_reader, plug_ins, readers
-
-
-def test_a_folder_is_looked_into_and_its_series_summed_up(campaign_folder):
-    found = list(inspect_paths([campaign_folder]))
-    assert [one.kind for one in found].count(Kind.FRAMES) == 1 and len(found) == 6
-    assert not any(one.fails for one in found)
-    assert sum(len(one.shown()) for one in found) < 40
 
 
 def test_a_bad_file_stops_nothing(copied):
@@ -352,18 +345,6 @@ def test_a_record_is_known_in_every_encoding(tmp_path, encoding):
         (tmp_path / "a.csv").write_text("\n".join(rows[:count]) + "\n", encoding=encoding)
         found = recognise(tmp_path / "a.csv")
         assert (found.kind, found.headings) == (Kind.RECORD, ("Zeit [s]", "T1 [°C]", "Z [µm]"))
-
-
-@pytest.mark.real_data
-def test_real_files_are_of_their_kind(real_file):
-    assert recognise(real_file("friedcucumber__RenishawWork/data/22.rtl")).kind is Kind.DEVIATIONS
-    assert recognise(real_file("CAIVIAC__FL_THERMAL/data/data.xlsx")).kind is Kind.RECORD
-    assert recognise(real_file("gtatters__Thermimage/inst/extdata/SampleCSQ.csq")).kind is Kind.FRAMES
-
-
-def test_headings_say_what_a_column_is():
-    assert column_unit("t1 [°C]") == "degC" and column_unit("speed") == ""
-    assert is_time("time") and is_time("時間(s)") and not is_time("speed [1/min]")
 
 
 def test_a_campaign_folder_is_sorted_out(campaign_folder):

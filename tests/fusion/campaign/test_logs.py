@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import xarray as xr
 
@@ -16,8 +14,6 @@ from fusion.campaign.config import CampaignError, DriversTable, load_campaign
 from fusion.campaign.draft import Asker, write_campaign
 from fusion.campaign.inputs import pipe_notices, read_record
 from fusion.campaign.logs import ContactSensors, TableError, read_drivers, read_sensors, split_heading
-from fusion.common import FusionError
-from interferometry.io.faults import LaserFormatError
 from tests.fusion.campaign_parts import without
 
 RECORD = """\
@@ -78,17 +74,6 @@ def test_drivers_are_sorted_and_bad_lines_listed(tmp_path: Path) -> None:
         read_drivers(path, DriversTable(file="drivers.csv", time="stamp").layout)
 
 
-def test_rows_without_a_time_at_the_end_of_a_log_refuse_no_log(tmp_path: Path) -> None:
-    path, rows = tmp_path / "drivers.csv", "".join(f"2026-03-09T06:3{k}:00Z,0.{k}\n" for k in range(3))
-    path.write_text(f"time,duty [1]\n{rows}" + 10 * ",0.5\n")
-    drivers = read_drivers(path)
-    assert drivers.sizes["time"] == 3
-    assert [one["line"] for one in json.loads(drivers.attrs["left_out"])] == list(range(5, 15))
-    path.write_text("time,duty [1]\n" + 10 * ",0.5\n" + rows)
-    with pytest.raises(LaserFormatError, match="10 of 13 lines cannot be used"):
-        read_drivers(path)
-
-
 def test_drivers_of_another_layout_are_those_of_headings_that_say_everything(tmp_path: Path) -> None:
     """A logger's table: a line about the station, a row of units, a mark for no reading, local times with day and month swapped."""
     (tmp_path / "plain.csv").write_text(
@@ -106,17 +91,6 @@ def test_drivers_of_another_layout_are_those_of_headings_that_say_everything(tmp
     assert plain["time"].attrs == logged["time"].attrs and logged["Speed"].attrs["units"] == "rpm"
     assert [one["line"] for one in json.loads(logged.attrs["left_out"])] == [6]
     assert DriversTable(file="drivers.csv", time_zone="Europe/Vienna").layout is None
-
-
-def test_a_record_is_converted_to_the_units_of_the_calculation(tmp_path: Path) -> None:
-    campaign = record(
-        tmp_path, "time [min],t1 [K],t2 [degC],ch1 [mm],spindle [rpm]\n0,293.15,21,0.001,0\n1,294.15,22,0.002,500\n"
-    )
-    data = read_record(load_campaign(campaign))
-    np.testing.assert_allclose(data["temperature"].values, [[20.0, 21.0], [21.0, 22.0]])
-    np.testing.assert_allclose(data["displacement"].values, [[1.0], [2.0]])
-    np.testing.assert_allclose(np.diff(data["time"].values) / np.timedelta64(1, "s"), [60.0])
-    assert data["driver_units"].values.tolist() == ["rpm"]
 
 
 @pytest.mark.parametrize(
@@ -144,15 +118,6 @@ def test_a_number_sign_in_a_heading_is_part_of_it_and_lines_are_counted_in_the_f
     assert (no_time["line"], no_time["value"]) == (8, "?")
 
 
-def test_a_time_of_day_that_is_missing_is_listed(tmp_path: Path) -> None:
-    rows = "".join(f"2026-03-09 06:3{k}:00,20,1,0\n" for k in range(6))
-    data = read_record(
-        load_campaign(record(tmp_path, f"time,t1 [degC],ch1 [um],spindle [rpm]\n,20,1,0\n{rows}", time="time"))
-    )
-    assert data.sizes["time"] == 6
-    assert [(one["line"], one["reason"]) for one in json.loads(data.attrs["left_out"])] == [(2, "is not a time")]
-
-
 @pytest.mark.parametrize(
     ("content", "time", "message"),
     [
@@ -168,47 +133,6 @@ def test_records_that_cannot_be_used_name_the_column(tmp_path: Path, content: st
     campaign = record(tmp_path, content, time=time)
     with pytest.raises(ValueError, match=message):
         read_record(load_campaign(campaign))
-
-
-@pytest.mark.real_data
-def test_a_published_record_is_read_whole(tmp_path: Path, real_file: Callable[[str], Path]) -> None:
-    """46.3 h of a spindle test: 16 temperatures, 5 displacements and the speed, every 15 s (11,115 rows)."""
-    path = real_file("CAIVIAC__FL_THERMAL/data/data.xlsx")
-    text = RECORD.format(file=path.as_posix(), time="時間(s)", more="")
-    (tmp_path / "campaign.toml").write_text(text, encoding="utf-8")
-    data = read_record(load_campaign(tmp_path / "campaign.toml"))
-    assert dict(data.sizes) == {"time": 11115, "sensor": 16, "channel": 5, "driver_name": 1}
-    assert (data["time"].values[-1] - data["time"].values[0]) / np.timedelta64(1, "h") == pytest.approx(46.3, abs=0.05)
-    assert data.attrs["left_out"] == "[]"
-
-
-def test_damaged_spreadsheets_are_named_whatever_their_reader_raises(
-    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Flipped bits and cut ends: the reader raises errors of zipfile, zlib, XML and missing keys, which are none of the package's."""
-    pd.DataFrame({"time [s]": [0, 1], "t1 [degC]": [20.0, 20.5], "ch1 [um]": [0.0, 0.1]}).to_excel(
-        tmp_path / "whole.xlsx", index=False
-    )
-    whole = np.frombuffer((tmp_path / "whole.xlsx").read_bytes(), np.uint8)
-    (tmp_path / "campaign.toml").write_text(
-        RECORD.format(file="damaged.xlsx", time="time [s]", more="").replace('drivers = ["spindle*"]', "")
-    )
-    refused = 0
-    for number in range(20):
-        damaged = whole.copy()
-        damaged[rng.integers(0, whole.size, 6)] ^= 1 << rng.integers(0, 8, 6, dtype=np.uint8)
-        (tmp_path / "damaged.xlsx").write_bytes(damaged[: None if number % 2 else rng.integers(whole.size)].tobytes())
-        campaign = load_campaign(tmp_path / "campaign.toml")
-        try:
-            read_record(campaign)
-        except (FusionError, LaserFormatError) as error:
-            assert "damaged.xlsx" in str(error)
-            refused += 1
-    assert refused > 10
-    monkeypatch.setattr("interferometry.io.spreadsheets.MOST_BYTES", 1000)
-    (tmp_path / "damaged.xlsx").write_bytes(whole.tobytes())
-    with pytest.raises(LaserFormatError, match=r"damaged\.xlsx: cannot be read as a spreadsheet"):
-        read_record(load_campaign(tmp_path / "campaign.toml"))
 
 
 def test_one_mark_for_no_reading_costs_one_reading(tmp_path: Path) -> None:
@@ -310,10 +234,6 @@ def test_a_sensor_that_breaks_is_left_out_and_named(copied: Path) -> None:
     assert fault.sensor == 1 and "jumps by 15 K" in fault.words and fault.onset_s == pytest.approx(3600.0, abs=120.0)
     # The others keep every sample.
     assert sensors.temperature.shape == (120, 2) and sensors.logged.shape == (120, 3)
-
-
-def test_a_campaign_without_sensors_has_none(copied: Path) -> None:
-    assert read_sensors(load_campaign(copied / "campaign.toml")) is None
 
 
 # Runs of a record: read in the order of their times, held to the same columns, and refused where they cannot be one test.

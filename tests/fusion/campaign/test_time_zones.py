@@ -30,13 +30,6 @@ def test_local_times_become_utc_in_winter_and_in_summer() -> None:
     assert lacks_zone(local) and not lacks_zone(placed)
 
 
-def test_readings_of_any_shape_are_brought_too() -> None:
-    stamps = np.array([[["2026-01-15T10:00", "NaT"]]], "datetime64[ns]")
-    readings = xr.Dataset({"time": (("cycle", "direction", "target"), stamps, {"reference": NO_ZONE})})
-    placed = bring_to_utc(readings, "Asia/Tokyo", file="laser.rtl")["time"].values
-    assert placed[0, 0, 0] == np.datetime64("2026-01-15T01:00") and np.isnat(placed[0, 0, 1])
-
-
 def test_times_with_a_zone_or_without_a_stated_one_stay() -> None:
     zoned = table("2026-07-15T10:00", reference="UTC in the file")
     assert bring_to_utc(zoned, "Europe/Vienna", file="") is zoned

@@ -123,7 +123,7 @@ def test_five_cycles_give_all_but_causes_and_say_what_those_need(folder, tmp_pat
 @pytest.mark.usefixtures("no_charts")
 @pytest.mark.parametrize(
     ("cycles", "targets", "directions"),
-    [(3, 2, BOTH), (5, 11, ("negative",)), (12, 3, BOTH), (12, 3, ("positive",))],
+    [(3, 2, BOTH), (5, 11, ("negative",)), (12, 3, ("positive",))],
 )
 def test_a_test_of_any_size_ends_with_what_it_can_carry(tmp_path, cycles, targets, directions):
     out = tmp_path / "results"
@@ -158,10 +158,7 @@ def published(path: Path, out: Path) -> Results:
 
 
 @pytest.mark.usefixtures("no_charts")
-@pytest.mark.parametrize(
-    ("cycles", "targets", "directions"),
-    [(1, 5, BOTH), (1, 2, ("negative",)), (2, 2, BOTH), (6, 5, ("positive",))],
-)
+@pytest.mark.parametrize(("cycles", "targets", "directions"), [(1, 5, BOTH), (3, 5, ("positive",))])
 def test_what_a_test_does_not_measure_is_judged_as_not_measured(tmp_path, cycles, targets, directions):
     results = published(write_laser(tmp_path / "campaign", cycles, targets, directions), tmp_path / "results")
     judged = {row.quantity: row.decision for row in results.iso230.tolerances}
@@ -175,11 +172,11 @@ def test_what_a_test_does_not_measure_is_judged_as_not_measured(tmp_path, cycles
 
 
 @pytest.mark.usefixtures("no_charts")
-@pytest.mark.parametrize("value", ["0", "10 * target + cycle"], ids=["zero", "moved alike"])
-def test_readings_without_scatter_end_with_the_values_of_the_standard_and_their_notice(tmp_path, value):
+def test_readings_without_scatter_end_with_the_values_of_the_standard_and_their_notice(tmp_path):
+    """All positions move alike from cycle to cycle."""
     path = write_laser(tmp_path / "campaign", 8, 5, BOTH)
     table = pd.read_csv(path.with_name("laser.csv"))
-    table.assign(deviation_um=table.eval(value)).to_csv(path.with_name("laser.csv"), index=False)
+    table.assign(deviation_um=10 * table["target"] + table["cycle"]).to_csv(path.with_name("laser.csv"), index=False)
     results = published(path, tmp_path / "results")
     assert [warning.code for warning in results.warnings].count("no_scatter") == 1
     assert results.drift is None
@@ -213,8 +210,7 @@ def of_record(folder: Path) -> Path:
 
 
 @pytest.mark.usefixtures("no_charts")
-@pytest.mark.parametrize("zone", ["Europe/Vienna", ""])
-@pytest.mark.parametrize("write", [of_laser, of_record])
+@pytest.mark.parametrize(("write", "zone"), [(of_laser, ""), (of_record, "Europe/Vienna")])
 def test_every_page_gives_the_date_of_the_test_in_its_own_zone(tmp_path, write, zone):
     path, out = write(tmp_path / "test"), tmp_path / "results"
     if zone:
@@ -282,10 +278,11 @@ def test_contact_sensors_stand_for_the_camera(folder, results_folder, tmp_path):
 
 
 @pytest.mark.usefixtures("no_charts")
-def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(folder, results_folder, tmp_path):
-    write_sensors(folder, results_folder / "fields.nc", gain=1.5)
-    path = without(folder / "campaign.toml", "interferometry", "drivers", "model", name="beside.toml", added=SENSORS)
-    results = run_campaign(path, tmp_path / "results")
+def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(camera_results, results_folder, tmp_path):
+    folder = shutil.copytree(camera_results.parent, tmp_path, dirs_exist_ok=True)
+    write_sensors(folder / "campaign", results_folder / "fields.nc", gain=1.5)
+    path = without(folder / "campaign" / "part.toml", name="part.toml", added=SENSORS)
+    results = run_campaign(path, folder / "results", resume=True)
     assert results.sensors is not None
     for sensor in results.sensors:
         assert sensor.rise_K == pytest.approx(1.5 * sensor.camera_rise_K, rel=0.1), sensor.name
@@ -359,7 +356,7 @@ def test_readings_without_times_beside_a_camera_are_refused(folder):
     assert not (folder / "never").exists()
 
 
-@pytest.mark.parametrize(("cycles", "renamed"), [(1, []), (2, []), (5, ROTARY)])
+@pytest.mark.parametrize(("cycles", "renamed"), [(1, []), (5, ROTARY)])
 def test_a_test_without_a_course_has_the_values_of_the_command_and_no_drift(tmp_path, cycles, renamed):
     path = write_laser(tmp_path / "test", cycles, 9)
     for name, other in renamed:

@@ -1,6 +1,5 @@
 """ISO 230-2 in the pipeline: quoted and first window, budgets, the sheet with tolerances and conditions, and a test from a file alone."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -223,13 +222,6 @@ def test_windows_that_decide_otherwise_are_counted():
         "µm. 1 of 3 windows decide otherwise." in told
         and say("judged", part.tolerances[1], part) == "pass, 1 of 3 windows otherwise"
     )
-
-
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
-    pipe = tmp_path / "laser.csv"
-    os.mkfifo(pipe)
-    with pytest.raises(CampaignError, match=r"laser\.csv: is a pipe, a socket or a device; name a file"):
-        read_test(pipe, None)
 
 
 @pytest.mark.parametrize(

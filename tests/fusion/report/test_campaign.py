@@ -33,19 +33,6 @@ def test_four_standard_deviations_stand_side_by_side(results_folder):
     assert abs(float(comparison["joint"].median()) - 0.3) < 0.05
 
 
-def test_levels_are_those_of_each_test(results_folder):
-    page = (results_folder / "report.html").read_text(encoding="utf-8")
-    assert read_results(results_folder).correlation is not None
-    for level in (
-        "2 % in the search before",
-        "0.5 % in the search over all",
-        "2.5 % together",
-        "at p up to 2 %",
-        "of 5 %",
-    ):
-        assert level in page
-
-
 def test_results_without_products_still_make_a_page():
     results = assemble("A", PARTS, [])
     told = describe_campaign(results, ORIGIN, {}, None)
@@ -61,12 +48,6 @@ def test_results_without_products_still_make_a_page():
     assert tables["Hotspots"][1][6:] == ["3", "–", "–"]
     limit = tables["Detection limit of every effect"][1]
     assert limit[:5] == ["dead path of the laser", "never", "–", "10 %", "refractive index of the air"]
-
-
-def test_what_the_uncertainty_of_the_drift_leaves_out_is_said_once_and_marked_at_its_figure(results_folder):
-    page = (results_folder / "report.html").read_text(encoding="utf-8")
-    assert "± scatter alone</div>" in page
-    assert page.count("It does not contain errors of the laser, its alignment, the temperature of the material") == 1
 
 
 ORIGIN = {
@@ -141,11 +122,6 @@ def test_sensors_that_lose_more_than_fewer_are_named(parts):
     losses = [np.inf if one.loss_um is None else one.loss_um for one in correlation_of(results).sensors.sets]
     expected = [k > 0 and loss > min(losses[:k]) for k, loss in enumerate(losses)]
     assert [fewer for _, fewer in told["sensors"]] == expected
-
-
-def test_nothing_is_told_where_nothing_was_tested(parts):
-    fused, results = parts
-    assert describe_correlation(fused, results.model_copy(update={"correlation": None}), None) is None
 
 
 def test_a_page_needs_the_variables_of_its_template():

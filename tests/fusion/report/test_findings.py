@@ -119,21 +119,6 @@ def test_numbers_of_a_fleet_are_findings(surfaces: dict[str, dict[str, Any]], na
     assert {key for key in columns if getattr(surfaces[name]["fleet"], key) is not None} == stated
 
 
-def test_the_findings_of_a_run_in_a_few_rows():
-    rows = dict(summary_rows(assemble("A", PARTS, [Notice("clock", "The clocks disagree.", "Set clock_offset.")])))
-    assert rows["registration"] == "0.10 mm rms"
-    assert "A = 1.00 \u00b1 0.20 \u00b5m" in rows["how much"]
-    assert rows["where"].startswith("Position 3 repeats worse than the others")
-    assert all(
-        part in rows["added"]
-        for part in ("step_event (p < 0.001)", "from 0.60 to 0.40 \u00b5m", "from 0.70 to 0.50 \u00b5m")
-    )
-    assert rows["held-out error"] == "0.60 -> 0.40 \u00b5m, as expected (0.35 to 0.43 \u00b5m)"
-    assert rows["plain predictions"].endswith("ridge regression with lagged copies 0.50 \u00b5m")
-    assert rows["next"].splitlines()[-1] == "3. Set clock_offset."
-    assert rows["warning"] == "The clocks disagree."
-
-
 def test_a_doubt_stands_beside_every_finding_that_rests_on_it():
     checks = [told("datum", passed=False)]
     rows = dict(summary_rows(assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])))

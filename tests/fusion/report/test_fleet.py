@@ -63,13 +63,6 @@ def test_a_row_says_what_the_results_say(whole, results_folder):
     assert columns == ["campaign", "verdict", "state", "exit code", "time / s"]
 
 
-def test_what_is_found_stands_before_how_the_run_went():
-    first = [column.heading for column in FINDINGS[:9]]
-    values = [f"{symbol} / µm" for symbol in "AREMB"]
-    assert first == ["campaign", *values, "maximum / °C", "held-out error / µm", "decision"]
-    assert not {column.key for column in FINDINGS} & {"state", "exit_code", "seconds", "peak_MB"}
-
-
 def test_the_maximum_is_that_of_the_fields_beside_a_laser(whole, results_folder):
     maps = open_dataset(results_folder / "fields.nc")
     highest = float(maps["temperature"].max())
@@ -158,12 +151,6 @@ def test_the_tests_of_one_axis_of_one_machine_are_drawn_over_their_dates_with_li
     assert draw_histories(unnamed) == []
     page = render_fleet(rows, started=STARTED)
     assert page.count("<figure") == 1 and '2026-03-01 <a href="m/3/report.html">m/3</a>' in page
-
-
-def test_a_legend_explains_what_is_shown_alone(whole):
-    assert "Drift: " in render_fleet([whole], started=STARTED)
-    page = render_fleet([replace(whole, drift_um=None, anomalies=None)], started=STARTED)
-    assert "Held-out error: " in page and "Drift: " not in page and "Anomalies: " not in page
 
 
 def test_decisions_are_counted(whole):

@@ -222,11 +222,6 @@ def test_a_value_without_uncertainty_has_no_sign_for_it_and_negative_places_a_mi
     assert describe_iso230(part, moved)["positions"].rows[0].cells[1] == "\u221220"
 
 
-def test_beside_a_sheet_the_terminal_shows_the_axis_alone(test_sheet):
-    (alone,) = iso230_tables(*test_sheet, title="A", axis_alone=True)
-    assert alone.row_count == 5 and len(iso230_tables(*test_sheet, title="A")) == 3
-
-
 def test_the_scatter_without_drift_stands_beside_two_windows_alone(part):
     readings, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
     dataset = joined(readings, estimate=estimate_drift(readings))
@@ -274,25 +269,6 @@ def test_the_settled_window_stands_with_the_first_one(part):
         "Unidirectional positioning accuracy A\u2193",
     ]
     assert terms[-1] == "Mean reversal error, with its sign"
-
-
-def test_the_budget_ends_with_both_sums(part):
-    rows = describe_iso230(part)["budget"].rows
-    assert [row.cells[0] for row in rows[-2:]] == ["U (k = 2) without the sampling of the cycles", "U (k = 2)"]
-    assert float(rows[-1].cells[3]) == pytest.approx(2 * part.A_um.u, rel=0.06)
-
-
-def test_what_is_assumed_and_what_is_missing_is_said(part):
-    sentence = say("iso230_uncertainty", part)
-    assert "laser with its air compensation 0.25 ppm (assumed)" in sentence
-    assert "can be stated under [interferometry.uncertainty]" in sentence
-    assert "does not contain the environmental variation" not in sentence
-    unknown = [
-        entry.model_copy(update={"u": None}) if entry.contributor == "environmental_variation" else entry
-        for entry in part.contributions
-    ]
-    sentence = say("iso230_uncertainty", part.model_copy(update={"contributions": tuple(unknown)}))
-    assert "U does not contain the environmental variation" in sentence
 
 
 def test_results_of_an_older_run_show_their_only_window(part):
@@ -344,19 +320,6 @@ def test_the_sheet_of_results_holds_the_hash_of_what_was_measured(results_folder
 def test_damaged_provenance_names_no_measured_file(damaged, tmp_path):
     (tmp_path / "provenance.json").write_text(damaged)
     assert files_of_run(tmp_path) == {}
-
-
-@pytest.mark.chain
-def test_the_document_of_word_says_what_the_page_says(stated, tmp_path):
-    sheet = describe_sheet(stated.title, stated.part, files=stated.files, version="0")
-    write_iso230(tmp_path / "sheet.docx", sheet, stated.part, stated.dataset, remarks=())
-    written = docx.Document(str(tmp_path / "sheet.docx"))
-    cells = [cell.text for grid in written.tables for row in grid.rows for cell in row.cells]
-    shown = [text for row in sheet.values.rows for text in row.cells]
-    shown += [text for pair in (*sheet.stated.identity, *sheet.stated.conditions) for text in pair]
-    assert [text for text in shown if text not in cells] == []
-    assert len(written.inline_shapes) == 1 and cells.count("Date, signature:") == 2
-    assert all(sha in written.paragraphs[-1].text for sha in sheet.files.values())
 
 
 @pytest.mark.chain

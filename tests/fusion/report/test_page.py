@@ -83,13 +83,6 @@ def test_what_a_reader_acts_on_comes_before_the_statistics(opened):
     assert [name for name in order if name in wanted] == wanted
 
 
-def test_the_summary_comes_first_and_fits_one_screen(opened):
-    page, _ = opened
-    box = page.locator("section#summary").bounding_box()
-    assert box["y"] + box["height"] < 900
-    assert "a reversal error that changes" in page.locator("section#summary .answers").inner_text()
-
-
 @pytest.mark.parametrize("width", [390, 1280])
 def test_nothing_scrolls_sideways(opened, width):
     page, _ = opened

@@ -4,16 +4,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from fusion.pipeline.consistency import inputs_part
 from fusion.report import findings as answers
 from fusion.report import wording
 from fusion.report.campaign import describe_model
 from fusion.report.findings import action, next_steps, step_phrase
-from fusion.report.wording import Row, Words, effect_words, print_table, say, table
+from fusion.report.wording import effect_words, say
 from fusion.results import numbers
-from fusion.results.axis import DutyPart, Evidence, Iso230Direction, Iso230Window, Iso230WithTable, SourcePart
+from fusion.results.axis import DutyPart, Evidence, Iso230WithTable, SourcePart
 from fusion.results.loop import (
     AxisStep,
     AxisUnexplained,
@@ -147,47 +146,6 @@ def test_parameters_are_words_with_units_and_the_range_that_fits_as_well():
     assert wording.in_words([1.0, True, None, "warm_up"]) == "1.00, yes, – and warm up"
 
 
-ISO = Iso230Part.model_validate(
-    PARTS["iso230"] | {f"{name}_um": {"value": 9.9017, "u": 1.378} for name in (*"BREMA", "mean_reversal")}
-)
-
-
-def test_axis_values_bear_the_terms_of_the_standard_of_one_approach_the_unidirectional_ones():
-    assert wording.iso230_values(ISO)["A"] == "9.9 \u00b1 2.8 \u00b5m"
-    assert wording.ISO230_TERMS["E"] == "Bidirectional systematic positioning error E"
-    assert wording.ISO230_TERMS["M"] == "Mean bidirectional positioning error M"
-    assert wording.ISO230_TERMS["B"] == "Reversal error B"
-    known, unknown = Quantity(value=9.9017, u=1.378), Quantity(value=None, u=None)
-    side = Iso230Direction(A_um=known, R_um=known, E_um=known)
-    other = Iso230Direction(A_um=unknown, R_um=unknown, E_um=unknown)
-    window = Iso230Window.model_construct(A_um=unknown, E_um=unknown, positive=other, negative=side)
-    assert wording.quoted_values(window) == {"A\u2193": "9.9 \u00b1 2.8 \u00b5m", "R\u2193": "9.9 \u00b1 2.8 \u00b5m"}
-    assert list(wording.quoted_values(ISO)) == ["A", "R", "B"]
-
-
-def test_a_step_has_both_pairs_of_errors():
-    step = StepPart.model_construct(
-        rmse_before_um=0.6, rmse_after_um=0.7, cross_rmse_before_um=0.5, cross_rmse_after_um=0.4
-    )
-    told = wording.say("step_errors", step)
-    assert "held-out error from 0.60 to 0.70 \u00b5m" in told and told.endswith(
-        "from the others: from 0.50 to 0.40 \u00b5m"
-    )
-    late = wording.say("step_errors", step.model_copy(update={"rmse_after_um": None}))
-    assert late.startswith("found after the hold-out was opened") and "0.60" not in late
-
-
-SHOWN = table([Words("Effect"), "Error / \u00b5m"], [["step", "0.4"], Row(["dead path", "0.3"], marked=True)])
-
-
-def test_the_terminal_shows_every_cell():
-    console = Console(width=60)
-    with console.capture() as capture:
-        console.print(print_table(SHOWN, "steps"))
-    text = capture.get()
-    assert all(cell in text for cell in ("steps", "Effect", "dead path", "0.4", "0.3"))
-
-
 def step(effect: str, **changes: Any) -> StepPart:
     told = {
         "effect": effect, "parameters": {}, "parameter_ranges": {}, "confirmed": True, "doubt": "", "event_time": None, "p_value": 1e-6,
@@ -317,19 +275,6 @@ def test_what_predicts_no_better_than_the_mean_explains_nothing():
     )
 
 
-def test_a_forecast_without_its_only_effect_is_that_of_the_declared_model():
-    alone = loop("partial", step("unseen_heat_source"), left_out_of_forecast=("unseen_heat_source",))
-    told = say("how_sure", results(alone))
-    assert "The forecast holds none of the added effects. Error of predicting cycles 49 to 60" in told
-    assert "With the added effect" not in told
-
-
-def test_nothing_has_to_be_done_with_what_was_measured():
-    record = RecordLoop.model_construct(**{**vars(loop("complete")), "channels": {}})
-    assert "use the displacements" in next_steps(results(record))[0]
-    assert "use the temperatures" in next_steps(results(None))[0]
-
-
 @pytest.mark.parametrize(
     ("changes", "stated"),
     [
@@ -383,15 +328,6 @@ def test_a_record_repeats_values_and_predicts_blocks_of_time():
     # The error rate of a name in a record is larger than its p-value.
     assert "Of 40 simulated records" in stated
     assert "Of 40" not in say("how_sure", results(loop("explained", step("step_event"))))
-
-
-def test_what_is_left_is_said_once():
-    shape = "a slow, smooth drift"
-    found = results(loop("unexplained", shape=shape, unconfirmed_effects={"dead_path": 9e-35}))
-    told = say("what_remains", found)
-    assert told.startswith(f"A{shape[1:]}: 0.20 µm rms.") and "dead path of the laser (p < 0.001)" in told
-    assert told.count("rms") == 1
-    assert "0.42 µm" in say("what_remains", results(loop("complete")))
 
 
 def test_nothing_is_not_said_to_remain_beside_an_effect_that_is_contradicted():
@@ -495,39 +431,6 @@ def test_every_attribution_has_its_sentence(verdict, part):
 def test_an_unseen_source_and_a_seen_place_are_reconciled(found, verdict, stated):
     told = say("reconcile", results(found, correlation=correlation(verdict)))
     assert stated in told and bool(stated) == bool(told)
-
-
-def test_a_position_that_stands_out_is_compared_with_the_others():
-    (anomaly,) = assemble("A", PARTS, []).anomalies or ()
-    placed = anomaly.model_copy(update={"position_mm": 40.0, "p_resolution": 0.01})
-    told = answers.say("anomaly_sentence", placed)
-    assert told.startswith("Position 3 (40 mm)") and "0.60 µm, that of the others 0.30 µm (p ≤ 0.01," in told
-    # Of one approach its own scatter is stated, not that of both.
-    evidence = anomaly.evidence.model_copy(update={"scatter_negative_um": 0.9})
-    one = anomaly.model_copy(update={"direction": "negative", "evidence": evidence})
-    told = answers.say("anomaly_sentence", one)
-    assert told.startswith("Position 3, negative approach,") and "0.90 µm" in told
-
-
-@pytest.mark.parametrize(
-    ("least", "stated"),
-    [
-        (3.1, "and least by 3.10 ± 0.20 µm at position 1 (0 mm) (± from scatter and estimate alone"),
-        (0.09, "and not noticeably at position 1 (0 mm) (± from"),
-    ],
-)
-def test_how_much_names_the_position_with_the_largest_drift(least, stated):
-    drift = {**PARTS["drift"], "position_mm": [0.0, 150.0], "range_um": [least, 11.127], "range_u_um": [0.1, 0.17]}
-    told = say("how_much", assemble("A", {**PARTS, "drift": drift}, []))
-    assert "11.13 ± 0.34 µm at position 2 (150 mm)" in told and stated in told and "see the ISO 230-2 budget" in told
-    told = say("how_much", assemble("A", {**PARTS, "drift": drift, "iso230": None}, []))
-    assert told.endswith("without laser, material temperature and expansion coefficient).")
-
-
-def test_a_drift_that_the_readings_do_not_show_is_stated_as_a_bound():
-    drift = {**PARTS["drift"], "position_mm": [0.0, 150.0], "range_um": [8e-9, 9e-9], "range_u_um": [0.17, 0.17]}
-    told = say("how_much", assemble("A", {**PARTS, "drift": drift}, []))
-    assert "no position drifted by as much as these readings can show: below 0.34 µm" in told and "0.00" not in told
 
 
 LOCAL = TimePart(first="2026-03-09T06:30:02Z", last="2026-03-09T10:41:02Z", zone="Europe/Vienna")

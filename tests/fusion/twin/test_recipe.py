@@ -113,16 +113,6 @@ def test_wrong_recipe_is_refused(tmp_path, text, message):
         read_recipe(write(tmp_path, text))
 
 
-def test_missing_recipe_is_refused(tmp_path):
-    with pytest.raises(RecipeError, match=r"none\.toml: cannot be read \(No such file or directory\); name"):
-        read_recipe(tmp_path / "none.toml")
-
-
-def test_unknown_packaged_recipe_names_those_there_are():
-    with pytest.raises(RecipeError, match=r"no packaged recipe 'nothing'; there are: .*paper"):
-        packaged_recipe("nothing")
-
-
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
@@ -156,13 +146,6 @@ def test_all_faults_of_a_recipe_are_named_together(tmp_path):
         read_recipe(write(tmp_path, text))
     keys = ("test.cycles = 0", 'test.feed_mm_per_min = "300"', "duty.kind")
     assert all(key in str(refused.value) for key in keys)
-
-
-def test_a_recipe_that_is_no_text_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "RECIPE.toml"
-    path.write_bytes(b'title = "\xe9"')
-    with pytest.raises(RecipeError, match=r"RECIPE\.toml: byte 9 is not UTF-8; save the recipe as UTF-8 text"):
-        read_recipe(path)
 
 
 def test_the_schema_accepts_every_recipe_of_the_project_and_refuses_what_the_reader_refuses() -> None:

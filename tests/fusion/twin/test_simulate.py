@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from fusion.twin.machine import INNER_PART, Drive, Session, first_order, random_levels, stream, switched_levels
+from fusion.twin.machine import INNER_PART, Drive, Session, first_order, random_levels, switched_levels
 from fusion.twin.recipe import AnomalyRecipe, Drift, EffectRecipe, Laser, Profile, Recipe
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
 from fusion.twin.simulate import (
@@ -65,13 +65,6 @@ def test_mean_profile_and_scatter_are_those_of_the_readings_without_and_of_their
     usual = readings["scatter"].drop_sel(target=3)
     assert float(usual.mean()) == pytest.approx(0.4, rel=0.05)
     assert float(readings["scatter"].sel(target=3).min()) > float(usual.max())
-
-
-def test_drift_moves_within_a_pass():
-    truth = simulate(BASE.vary(drift={"walk": "none"}))
-    offset = truth.readings["table_offset"].values
-    assert np.all(np.ptp(offset[5:, 0], axis=1) > 0)
-    assert truth.readings["time"].values[0, 1, -1] < truth.readings["time"].values[0, 1, 0]
 
 
 def test_lost_readings_are_lost_at_the_stated_rate():
@@ -174,13 +167,6 @@ def holds_min(level: np.ndarray) -> np.ndarray:
     return np.diff(TIME_S[changes]) / 60.0
 
 
-def test_stream_depends_on_seed_and_name_only():
-    draw = stream(4, "noise").standard_normal(5)
-    np.testing.assert_array_equal(stream(4, "noise").standard_normal(5), draw)
-    assert not np.array_equal(stream(4, "profile").standard_normal(5), draw)
-    assert not np.array_equal(stream(5, "noise").standard_normal(5), draw)
-
-
 def test_random_levels_are_held_between_0_4_and_1_6_of_the_mean(rng):
     level = random_levels(TIME_S, 0.2, 0.9, 30.0, rng)
     hold = holds_min(level)
@@ -191,12 +177,6 @@ def test_random_levels_are_held_between_0_4_and_1_6_of_the_mean(rng):
     assert hold.mean() == pytest.approx(30.0, abs=1.5)
     # uniform levels between 0.2 and 0.9
     assert level.mean() == pytest.approx(0.55, abs=0.03)
-
-
-def test_alternate_levels_take_turns(rng):
-    level = random_levels(TIME_S, 0.2, 0.9, 30.0, rng, alternate=True)
-    assert set(level.tolist()) == {0.2, 0.9}
-    assert holds_min(level).min() >= 12.0 - 10.0 / 60.0
 
 
 def test_switched_levels_have_a_minimum_hold_and_an_exponential_rest(rng):

@@ -65,14 +65,6 @@ def test_any_number_of_threads_gives_the_same_fields_bit_for_bit(cores, film, mo
 
 
 @ends_late
-def test_a_cluster_of_two_workers_gives_the_same_fields_bit_for_bit(cluster, film):
-    frames, registration = film
-    alone = reduce_frames(frames, registration, GRID, BOUNDS, block_s=4)
-    together = reduce_frames(frames, registration, GRID, BOUNDS, block_s=4, scheduler=cluster.scheduler_address)
-    assert_equal_bits(alone, together)
-
-
-@ends_late
 def test_a_worker_that_is_killed_in_the_middle_loses_nothing(cluster, film, monkeypatch, tmp_path):
     frames, registration = film
     monkeypatch.setattr(still, "STRETCH_FRAMES", 2)

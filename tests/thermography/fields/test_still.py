@@ -238,14 +238,6 @@ def test_a_single_shaken_frame_is_reported_and_no_warm_up_is_taken_for_a_knock(r
     assert json.loads(fields.attrs["frames_shaken"]) == ["a.seq#3"]
 
 
-def test_the_first_frame_is_unchecked_if_its_discs_have_no_contrast(rng, tmp_path):
-    plain = Scene(discs=()).render() + rng.normal(0, 0.05, (480, 640))
-    frames = record(tmp_path / "a.seq", [plain] * 2)
-    fields = reduce_frames(frames, registered(), GRID, edges(0, 2))
-    # The first one is what the others' picture of the table is compared with.
-    assert json.loads(fields.attrs["frames_unchecked"]) == ["a.seq#0"]
-
-
 BOUNDS = edges(0, 4, 8, 11, 14)
 
 

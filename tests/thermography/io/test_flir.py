@@ -281,16 +281,6 @@ def test_a_sequence_is_read_on_from_where_it_was_read_before(tmp_path):
     assert [frame.time for frame in [*frames, *rest]] == [frame.time for frame in every]
 
 
-def test_a_sequence_that_is_over_tells_what_its_end_lacks(tmp_path):
-    path = tmp_path / "a.seq"
-    sequence(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) - 500])
-    frames, rejected, following = index_sequence(path)
-    assert (len(frames), len(rejected), following) == (2, 1, 2 * len(whole) // 3)
-    assert index_sequence(path, growing=True)[1] == []
-
-
 @pytest.mark.parametrize("index", [index_frames, index_recordings])
 def test_files_opened_by_threads_give_the_same_frames_and_faults(tmp_path, monkeypatch, index):
     """Where a folder is not in memory, threads wait for the disk; frames, order and reasons must not show it."""

@@ -146,14 +146,6 @@ def test_a_variable_of_no_numbers_is_refused(tmp_path, kind):
         read_stack(tmp_path / "a.nc")
 
 
-def test_of_many_variables_a_message_names_some(tmp_path):
-    with h5py.File(tmp_path / "a.nc", "w") as file:
-        for number in range(300):
-            file.create_dataset(f"v{number}", (3, 4, 5), "f4")
-    with pytest.raises(StackError, match=r"the variables v0, v1, .*v\d+, \[\.\.\.\] over three dimensions"):
-        read_stack(tmp_path / "a.nc")
-
-
 def test_what_a_library_says_of_a_long_attribute_is_cut(tmp_path):
     time = xr.DataArray(np.arange(3), dims="time", attrs={"units": "days since 2026-01-01", "calendar": "x" * 50_000})
     values = xr.DataArray(np.zeros((3, 4, 5)), dims=("time", "y", "x"), coords={"time": time})

@@ -2,7 +2,6 @@
 
 import shutil
 
-import h5py
 import numpy as np
 import pytest
 
@@ -33,11 +32,6 @@ def test_one_scale_holds_all_cycles_and_the_fields_stay_on_disk(products, result
     assert products.fields["temperature_rise"].variable._in_memory is False
 
 
-def test_cycles_are_those_of_the_test(products):
-    assert products.cycles.tolist() == list(range(1, 25))
-    assert products.field_hours.shape == (24,) and products.field_hours[0] > 0
-
-
 def test_a_laser_alone_a_camera_alone_and_no_results(results_folder, tmp_path):
     laser = shutil.copytree(results_folder, tmp_path / "laser")
     (laser / "fields.nc").unlink()
@@ -51,26 +45,6 @@ def test_a_laser_alone_a_camera_alone_and_no_results(results_folder, tmp_path):
     assert seen.cycles.size == 24 and seen.field_hours[0] == 0.0
     with pytest.raises(ResultsError, match=r"there is no results\.json in it"):
         Products(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["fields", "deviations"])
-def test_a_damaged_product_is_named(results_folder, tmp_path, name):
-    (tmp_path / "results.json").write_bytes((results_folder / "results.json").read_bytes())
-    (tmp_path / f"{name}.nc").write_bytes((results_folder / f"{name}.nc").read_bytes()[:5000])
-    with pytest.raises(DamagedProductError, match=rf"{name}\.nc"):
-        getattr(Products(tmp_path), name)
-
-
-def test_fields_of_another_kind_are_told_and_not_left_open(results_folder, tmp_path):
-    (tmp_path / "results.json").write_bytes((results_folder / "results.json").read_bytes())
-    (tmp_path / "fields.nc").write_bytes((results_folder / "deviations.nc").read_bytes())
-    seen = Products(tmp_path)
-    with pytest.raises(DamagedProductError, match="another kind of file") as told:
-        seen.fields  # noqa: B018 - it is opened when it is asked for
-    assert told.tb is not None, "the stack still holds what was opened"
-    # A file that is open for reading cannot be opened for writing.
-    with h5py.File(tmp_path / "fields.nc", "r+"):
-        pass
 
 
 def test_products_that_the_run_did_not_write_are_told(results_folder, tmp_path):

@@ -16,7 +16,6 @@ from fusion.app.setup.form import (
     Form,
     direction_text,
     form_fields,
-    missing,
     read_direction,
     read_fields,
     write_fields,
@@ -113,15 +112,6 @@ def test_changed_fields_are_written_and_all_others_stay(copied):
     assert loaded.plan.size_mm == (720.0, 180.0)
     assert loaded.thermography.emissivity_u == 0.02 and loaded.thermography.reflected_temperature_degC is None
     assert loaded.plan.axis.direction == (0.8, 0.6)
-
-
-def test_a_needed_field_may_be_left_for_later(copied):
-    campaign = write_fields(open_campaign(copied), {"plan.axis.origin.0": ""})
-    assert campaign.value("plan", "axis", "origin")[0] is None and campaign.value("plan", "axis", "origin")[1]
-    assert missing(campaign) == ["Spindle at axis position 0, x (mm)"] and missing(open_campaign(copied)) == []
-    (copied / "campaign.toml").unlink()
-    (copied / "fiducials.csv").unlink()
-    assert missing(open_campaign(copied))[-1] == 'fiducials = "FILL IN"'
 
 
 @pytest.mark.parametrize(
@@ -268,16 +258,6 @@ def test_lists_and_numbers_are_written_as_such_and_words_in_place_of_numbers_ref
         write_fields(campaign, {"thermography.camera_scale_u": "half"})
 
 
-def test_every_file_of_a_campaign_has_a_row(campaign_folder):
-    shown = "".join(part.object for part in found_in_folder(campaign_folder))
-    for name, content in (
-        ("thermal/*.jpg", "24 frames of 640 x 480"),
-        ("laser.csv", "24 cycles, 6 targets"),
-        ("fiducials.csv", "12 discs"),
-    ):
-        assert name in shown and content in shown
-
-
 def test_a_wrong_file_is_named_with_its_reason_and_escaped(tmp_path):
     (tmp_path / "<b>.csv").write_text("nonsense\n1\n")
     shown = "".join(part.object for part in found_in_folder(tmp_path))
@@ -288,11 +268,6 @@ def test_a_campaign_file_below_is_led_to(copied):
     shown = "".join(part.object for part in found_in_folder(copied.parent))
     assert f"{copied.name}/campaign.toml is the campaign file of a folder below" in shown
     assert "of a folder below" not in "".join(part.object for part in found_in_folder(copied))
-
-
-def test_an_empty_folder_says_what_to_do(tmp_path):
-    (only,) = found_in_folder(tmp_path)
-    assert "holds no file; put the files of the measurement into it" in only.object
 
 
 def test_bytes_and_text_are_written_as_they_came(tmp_path):

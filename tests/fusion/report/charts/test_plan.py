@@ -173,13 +173,6 @@ def test_every_cycle_comes_back_to_the_decimals_that_are_shown(fields):
     assert found.note == ""
 
 
-def test_a_cell_that_is_lost_in_one_cycle_returns(fields):
-    holed = fields.copy(deep=True)
-    holed["temperature_rise"][4, 2, 3] = np.nan
-    rise = holed["temperature_rise"].values
-    np.testing.assert_allclose(decoded(thermal_map.plot_thermal_map(holed)[0], "rise", rise.shape), rise, atol=0.00501)
-
-
 def test_the_scale_holds_every_value_but_a_far_one(fields):
     _, about = thermal_map.plot_thermal_map(fields)[0].figure.tags
     rise = fields["temperature_rise"]
@@ -232,12 +225,6 @@ def test_a_long_recording_is_thinned_and_says_so(fields, monkeypatch):
     assert found.cycles == [*range(1, 48, 2), 48]
     monkeypatch.setattr(thermal_map, "_MAP_BUDGET", 5 * cells * 20)
     assert thermal_map.plot_thermal_map(long)[1].note.startswith("The map shows means of 2 × 2 cells")
-
-
-def test_a_recording_without_readings_has_a_map_without_a_line(fields):
-    alone = fields.drop_vars(["target", "target_x", "target_y"])
-    chart, found = thermal_map.plot_thermal_map(alone)
-    assert found.quantities and not parts_of(chart.figure, "Arrow")
 
 
 def test_a_place_of_the_plan_is_drawn_where_the_frame_shows_it(fields):

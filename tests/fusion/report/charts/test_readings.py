@@ -10,7 +10,6 @@ from fusion.report.charts import readings as neighbours
 from fusion.report.charts.readings import (
     plot_cycles,
     plot_drift,
-    plot_history,
     plot_position_scatter,
     plot_profile,
     plot_reversal,
@@ -103,16 +102,6 @@ def test_both_approaches_have_one_scale_and_every_cycle_a_line(deviations):
     assert len(charts[0].columns["deviation / µm"]) == 24 * 6
 
 
-def test_the_history_holds_readings_and_the_line_through_them(deviations):
-    drift = group(deviations, "estimate")
-    chart = plot_history(deviations, drift, 2)
-    read = deviations["deviation"].sel(target=2, direction="positive")
-    np.testing.assert_array_equal(chart.columns["deviation, positive approach / µm"], read)
-    noise = drift["noise"].sel(target=2, direction="positive")
-    np.testing.assert_allclose(chart.columns["profile and drift, positive approach / µm"], read - noise)
-    assert chart.figure.title.text.text == f"position 2 ({float(deviations['position'].sel(target=2)):g} mm)"
-
-
 def test_windows_beside_the_whole_test(deviations):
     windows = group(deviations, "iso")
     chart = plot_windows(windows)
@@ -157,15 +146,6 @@ def test_means_and_spans_are_those_of_the_readings():
     texts = {label.text for label in parts_of(chart.figure, "Label")}
     assert texts == {f"{symbol} {number(true[symbol])}" for symbol in "AEB"}
     assert chart.seen.startswith("Mean deviation over 0.00 to 50.00 mm of the axis with \u00b12 s: positive approach ")
-
-
-def test_one_approach_has_a_chart_without_b():
-    x = np.random.default_rng(5).normal(0, 1, (5, 2, 6))
-    x[:, 1] = np.nan
-    test = test_made(x)
-    chart = plot_test(evaluate_iso230(test), test["position"])
-    assert "mean, negative approach / \u00b5m" not in chart.columns
-    assert not any(label.text.startswith("B") for label in parts_of(chart.figure, "Label"))
 
 
 def test_one_cycle_of_a_rotary_axis_has_its_readings_and_units():

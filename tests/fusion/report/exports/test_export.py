@@ -267,14 +267,6 @@ def test_a_record_has_a_workbook_of_its_own(tmp_path):
     assert {path.name for path in written} >= {"distortions.csv", "readings.csv", "hold-out_errors.csv"}
 
 
-def test_a_record_is_no_compensation_table_and_the_message_says_why(tmp_path):
-    write_record(tmp_path)
-    with pytest.raises(
-        ExportError, match=r"a record of displacements has no target positions, .* --format csv and xlsx"
-    ):
-        export_results(tmp_path, "siemens840d", tmp_path / "out")
-
-
 def test_pictures_have_a_workbook_with_bounds_beyond_the_calibrated_range(tmp_path):
     dims, count = ("time", "region"), 3
     highest = np.array([[90.0], [250.0], [311.67]])
