@@ -12,20 +12,19 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import NDArray
 
 from fusion.analysis.attribution.correlate import correlate, find_source
 from fusion.analysis.attribution.modes import disc
 from fusion.analysis.attribution.places import compare_places
+from tests.soak import simulator
 from tests.soak.rates import campaigns, rate, wilson
+from tests.soak.simulator import Array, deviations_of, fields_of, first_order
 
 pytestmark = pytest.mark.slow
 
-Array = NDArray[np.float64]
 RUNS = campaigns(60)
 CELLS, CELL_MM, STEP_S, CYCLE_S, TARGETS = (12, 24), 20.0, 28.0, 252.0, 16
 SPOTS_MM = ((110.0, 70.0), (350.0, 90.0), (230.0, 190.0))
-START = np.datetime64("2026-03-09T08", "ns")
 Courses = Callable[[Array, Array, np.random.Generator], tuple[Array, Array]]
 
 
@@ -40,11 +39,8 @@ def switched(steps: int, rng: np.random.Generator) -> Array:
     return (np.cumsum(rng.random(steps) < STEP_S / 1800.0) + rng.integers(2)) % 2.0
 
 
-def lagged(source: Array, time_constant_s: float) -> Array:
-    state, kept = np.zeros(source.size), np.exp(-STEP_S / time_constant_s)
-    for step in range(1, source.size):
-        state[step] = kept * state[step - 1] + (1.0 - kept) * source[step - 1]
-    return state
+def lagged(source: Array, minutes: float) -> Array:
+    return first_order(STEP_S * np.arange(source.size), source, minutes)
 
 
 def heated(loads: Array) -> Array:
@@ -67,7 +63,7 @@ def heated(loads: Array) -> Array:
 
 def another_part(loads: Array, rise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """A part that is switched by itself and logged by nobody."""
-    course = 4.0 * lagged(switched(len(loads), rng), 2400.0)
+    course = 4.0 * lagged(switched(len(loads), rng), 40.0)
     return course, 0.5 * course
 
 
@@ -78,21 +74,19 @@ def random_walk(loads: Array, rise: Array, rng: np.random.Generator) -> tuple[Ar
 
 def room(loads: Array, rise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """A room that forgets itself in 36 min."""
-    kept, course = np.exp(-STEP_S / 2160.0), rng.standard_normal(len(loads))
-    for step in range(1, len(loads)):
-        course[step] = kept * course[step - 1] + np.sqrt(1.0 - kept**2) * course[step]
+    course = simulator.room(rng, STEP_S * np.arange(len(loads)))
     return course, 0.5 * course
 
 
 def by_a_place(loads: Array, rise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """2 um/K of the second spot after 30 min, beside a random walk."""
     common, proportional = random_walk(loads, rise, rng)
-    return common + 2.0 * lagged(rise[:, 4, 17], 1800.0), proportional
+    return common + 2.0 * lagged(rise[:, 4, 17], 30.0), proportional
 
 
 def by_an_unseen_part(loads: Array, rise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """6 um by a part out of sight that the load of the second spot heats, 3 um more at the far end; the table moves nothing."""
-    course = 6.0 * lagged(loads[:, 1], 2400.0)
+    course = 6.0 * lagged(loads[:, 1], 40.0)
     return course, 0.5 * course
 
 
@@ -106,19 +100,11 @@ def session(cycles: int, drift: Courses, rng: np.random.Generator) -> tuple[xr.D
     seconds = CYCLE_S * (np.arange(cycles)[:, None, None] + sites / (2 * TARGETS))
     grid, scaled = STEP_S * np.arange(steps), np.linspace(-1.0, 1.0, TARGETS)
     deviation = np.interp(seconds, grid, common) + scaled * np.interp(seconds, grid, proportional)
-    dims = ("cycle", "direction", "target")
-    readings = xr.Dataset(
-        {
-            "deviation": (dims, deviation + 0.4 * rng.standard_normal(seconds.shape)),
-            "time": (dims, START + (1e9 * seconds).astype("timedelta64[ns]")),
-            "position": ("target", 225.0 * (1.0 + scaled)),
-        },
-        {"cycle": np.arange(cycles), "direction": ["positive", "negative"], "target": np.arange(1, TARGETS + 1)},
-    )
+    deviation += 0.4 * rng.standard_normal(seconds.shape)
     y, x = (CELL_MM * (np.arange(count) + 0.5) for count in CELLS)
     seen = rise[::3] + 0.03 * rng.standard_normal(rise[::3].shape)
-    time = START + (1e9 * grid[::3]).astype("timedelta64[ns]")
-    return readings, xr.DataArray(20.0 + seen, {"time": time, "y": y, "x": x}, ("time", "y", "x"))
+    film = fields_of(grid[::3], x, y, 20.0 + seen)["frame_temperature"]
+    return deviations_of(seconds, 225.0 * (1.0 + scaled), deviation), film
 
 
 def maps_of(cycles: int, drift: Courses, seed: int) -> xr.DataTree:
