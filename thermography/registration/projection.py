@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -162,6 +162,9 @@ _REQUIRED_GAIN = 0.75
 #: frame. A k1 of 0.2 moves a corner of a 4:3 frame by 8 % of its distance from the centre, as wide-angle thermal lenses do; k2 adds up
 #: to half of that there, p1 and p2 of 0.002 about one pixel of 640 at the edge (decentred by some tenths of a degree).
 LENS_SPREAD = np.array([0.2, 0.1, 0.002, 0.002])
+#: A lens whose k1 is smaller has less of the others, in proportion (a principal point off the middle shows as k1 times its distance, and
+#: higher orders go with the first), but not less than this share of their spread: 0.25 px of decentring at the edge.
+_LEAST_SHARE = 0.25
 #: Fewest discs whose residuals can tell whether k1 is needed; with fewer it is fitted against its spread alone.
 _LEAST_FOR_CHOICE = 7
 #: Points on the rim of a disc, as unit circle. The centroid of their image polygon shows 98.9 % of the perspective shift of the disc's
@@ -373,11 +376,21 @@ def fit_projection(observations: DiscObservations, start: Projection, coefficien
 
 @dataclass(frozen=True)
 class DiscFit:
-    """A projection fitted to discs, with the number of distortion coefficients among its parameters."""
+    """A projection fitted to discs, with the number of distortion coefficients among its parameters and their spread before any disc."""
 
     observations: DiscObservations
     projection: Projection
     coefficients: int
+    spread: Array = field(default_factory=lambda: LENS_SPREAD)
+
+    def with_unfitted(self, factor: float) -> DiscFit:
+        """The fit with all coefficients among its parameters: those that were not fitted are not known to be zero. Against their spread
+        they are as large as k1 is, or may be where the discs hardly determine it.
+        """
+        of_k1 = replace(self, coefficients=max(self.coefficients, 1))
+        k1 = np.hypot(self.projection.distortion[0], np.sqrt(of_k1.covariance(factor)[8, 8]))
+        share = np.where(np.arange(len(LENS_SPREAD)) < of_k1.coefficients, 1.0, max(k1 / LENS_SPREAD[0], _LEAST_SHARE))
+        return replace(self, coefficients=len(LENS_SPREAD), spread=share * LENS_SPREAD)
 
     def leave_one_out_mm(self) -> Array:
         """Distance by which each disc is missed by the fit to all other discs, (n,) mm; NaN of four, which determine the fit."""
@@ -422,7 +435,7 @@ class DiscFit:
 
     def _prior_information(self) -> Array:
         """Inverse covariance of the parameters before any disc: nothing is known of the homography."""
-        return np.diag(np.concatenate([np.zeros(8), LENS_SPREAD[: self.coefficients] ** -2.0]))
+        return np.diag(np.concatenate([np.zeros(8), self.spread[: self.coefficients] ** -2.0]))
 
     def _weighted_jacobian(self) -> Array:
         """Derivative of the discs' sensor positions by the parameters over their uncertainty, (n, 2, parameters)."""

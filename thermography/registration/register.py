@@ -28,7 +28,6 @@ from thermography.registration.discs import (
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import (
     LENS_MODELS,
-    LENS_SPREAD,
     DiscFit,
     DiscObservations,
     Lens,
@@ -957,6 +956,7 @@ def _registration(
     # Four places have nothing that checks them: each may err unnoticed by up to its diameter, rectangular (JCGM 100:2008, 4.3.7).
     reach_mm = np.array([disc.diameter_mm if len(discs) == 4 else 0.0 for disc in discs])
     hidden = replace(observations, u_px=np.hypot(observations.u_px, reach_mm * px_per_mm / np.sqrt(3.0 * factor_u)))
+    fit_of_u = replace(fit, observations=hidden)
     return Registration(
         homography=np.linalg.inv(projection.plan_to_sensor),
         distortion=projection.distortion,
@@ -976,7 +976,7 @@ def _registration(
         shape=shape,
         lens=lens,
         optics=optics,
-        covariance=DiscFit(hidden, projection, len(LENS_SPREAD) if lens is None else 0).covariance(factor_u),
+        covariance=(fit_of_u if lens is not None else fit_of_u.with_unfitted(factor_u)).covariance(factor_u),
     )
 
 
