@@ -39,6 +39,8 @@ class View:
         k1, k2, p1, p2.
     shape : (int, int)
         Rows and columns.
+    off_px : (float, float)
+        Principal point from the middle of the frame.
     """
 
     turn: np.ndarray
@@ -46,12 +48,12 @@ class View:
     focal_px: float
     lens: np.ndarray
     shape: tuple[int, int]
+    off_px: tuple[float, float] = (0.0, 0.0)
 
     @property
     def matrix(self) -> np.ndarray:
-        return np.array(
-            [[self.focal_px, 0, (self.shape[1] - 1) / 2], [0, self.focal_px, (self.shape[0] - 1) / 2], [0, 0, 1]]
-        )
+        column, row = (np.array(self.shape[::-1]) - 1) / 2 + self.off_px
+        return np.array([[self.focal_px, 0, column], [0, self.focal_px, row], [0, 0, 1]])
 
     def to_sensor(self, points_mm: np.ndarray) -> np.ndarray:
         """Project plan points (n, 2) mm to pixels (n, 2)."""
@@ -93,7 +95,9 @@ def draw_view(
     shape: tuple[int, int] = (480, 640),
     centre_mm: tuple[float, float] = (250.0, 150.0),
 ) -> View:
-    """Draw a camera at random: tilt up to `tilt_deg` about any axis, any roll within 10 degrees, k1 from -0.25 to 0.1 unless given."""
+    """Draw a camera at random: tilt up to `tilt_deg` about any axis, any roll within 10 degrees, and a lens unless given, as calibrations
+    find them: k1 from -0.25 to 0.1, k2 up to twice its square, principal point off by 1 % of the width, decentred by 5e-4.
+    """
     azimuth, roll = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(-10, 10))
     tilt = np.deg2rad(tilt_deg) * (1.0 if tilt_deg > 15 else rng.uniform(0, 1))
     turn, _ = cv2.Rodrigues(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
@@ -102,8 +106,12 @@ def draw_view(
     distance = focal_px * rng.uniform(*mm_per_px) * (1 + 0.25 * np.sin(tilt))
     aim = np.array(centre_mm) + rng.uniform(-6, 6, 2)
     shift = np.array([0.0, 0.0, distance]) - turn @ np.array([*aim, 0.0])
-    coefficients = np.array([rng.uniform(-0.25, 0.1), 0.0, 0.0, 0.0] if lens is None else lens, float)
-    return View(turn, shift, focal_px, coefficients, shape)
+    if lens is not None:
+        return View(turn, shift, focal_px, np.array(lens, float), shape)
+    k1 = rng.uniform(-0.25, 0.1)
+    coefficients = np.array([k1, rng.uniform(0, 2) * k1**2, *rng.normal(0, 5e-4, 2)])
+    column, row = rng.normal(0, 0.01 * shape[1], 2)
+    return View(turn, shift, focal_px, coefficients, shape, (column, row))
 
 
 @dataclass(frozen=True)

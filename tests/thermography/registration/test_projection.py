@@ -119,8 +119,19 @@ def test_where_discs_are_few_the_spread_among_lenses_is_the_uncertainty():
     observations = DiscObservations(TRUE.to_sensor(PLAN), PLAN, np.full(12, 1e-6), np.full(12, 0.02)).select(four)
     fit = select_lens_model(observations, fit_homography(observations, TRUE))
     assert (fit.coefficients, fit.projection.distortion[0]) == (1, pytest.approx(0.0, abs=1e-6))
-    covariance = DiscFit(observations, fit.projection, 4).covariance(1.0)
+    covariance = fit.with_unfitted(1.0).covariance(1.0)
     np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)[8:]), LENS_SPREAD, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("k1", "share"), [(0.0, 0.25), (-0.1, 0.5), (-0.3, 1.5)])
+def test_what_six_discs_leave_open_of_the_lens_goes_with_its_k1(k1, share):
+    scene = Scene(k1=k1)
+    six = np.isin(np.arange(12), [0, 3, 5, 8, 10, 11])
+    observations = DiscObservations(scene.to_pixels(PLAN), PLAN, np.full(12, 1e-6), np.full(12, 1e-3)).select(six)
+    start = Projection(np.eye(3), np.zeros(4), FOCAL_PX, (319.5, 239.5))
+    fit = select_lens_model(observations, fit_homography(observations, start))
+    assert fit.coefficients == 1
+    np.testing.assert_allclose(fit.with_unfitted(1.0).spread[1:], share * LENS_SPREAD[1:], rtol=0.1)
 
 
 @pytest.mark.parametrize("coefficients", [0, 1, 4])
