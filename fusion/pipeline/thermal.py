@@ -296,7 +296,15 @@ def _held_against_discs(
     pattern_u_K = np.sqrt(np.mean((shown.pattern_K - shown.pattern_K[0]) ** 2, axis=1))
     u_K = np.hypot(zero_u_K, np.interp(every, shown.index, pattern_u_K))
     part = camera.part.model_copy(update={"largest_u_K": float(u_K.max())})
-    return replace(camera, u_K=u_K, part=part, zero=share * zero), {**found, "zero_K": float(np.ptp(left))}
+    return replace(camera, u_K=u_K, part=part, zero=share * zero), {**found, "zero_K": float(np.ptp(_without_noise(left)))}
+
+
+def _without_noise(course: Array) -> Array:
+    """A course by the line through the five values nearest to each: what the camera adds changes slowly, and a ramp keeps its size."""
+    index, span = np.arange(len(course)), np.arange(5)
+    start = np.clip(index - 2, 0, len(course) - 5)
+    nearest = course[start[:, None] + span]
+    return np.asarray(nearest.mean(axis=1) + nearest @ (span - 2) / 10 * (index - start - 2))
 
 
 def camera_corrected(part: CameraPart) -> bool:

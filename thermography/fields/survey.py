@@ -384,8 +384,8 @@ class DiscLevels:
         if share > _DULL:
             return None
         added = (disc - max(share, 0.0) * table) / (1.0 - max(share, 0.0))
-        added = scipy.ndimage.uniform_filter1d(added, _SMOOTHED, axis=0, mode="nearest")
-        scores, sizes, places = np.linalg.svd(_beside(added, alike), full_matrices=False)
+        courses = scipy.ndimage.uniform_filter1d(_beside(added, alike), _SMOOTHED, axis=0, mode="nearest")
+        scores, sizes, places = np.linalg.svd(courses, full_matrices=False)
         return DiscCourses(
             self.index[kept],
             added.mean(axis=1) - added[0].mean(),
