@@ -34,6 +34,7 @@ from fusion.results.progress import Report
 from fusion.results.results import Outcome, Parts
 from thermography.fields.cycle_fields import CLIPPED, OBJECT, SURFACE_EDGE
 from thermography.fields.hotspots import Hotspot, detect_hotspots
+from thermography.fields.objects import EDGE_MM
 
 #: Hotspots are tested on cells that are seen in more than this share of the frames.
 _SEEN_SHARE = 0.8
@@ -81,12 +82,14 @@ def _find_hotspots(fields: xr.Dataset) -> list[Hotspot]:
     """The hotspots of all cycles, but objects, unnamed surfaces, and those whose height the emissivity of a named surface may have made."""
     flags, x, y = fields["quality_flag"].values, fields["x"].values, fields["y"].values
     rise = fields["temperature_rise"].where((flags & OBJECT) == 0)
+    # A corner of such a surface and the edge that its step has: the table beside it looks like a peak.
     unnamed = json.loads(fields.attrs.get("unnamed_surfaces", "[]"))
+    surfaces = [(one, np.hypot(*one["size_mm"]) / 2 + EDGE_MM) for one in unnamed]
     # By an object cells show a part of it, by clipped ones the source is hotter than any that is seen.
     hidden = scipy.ndimage.binary_dilation((flags & (OBJECT | CLIPPED)) > 0, np.ones((1, 5, 5)))
     spots = []
     for spot in detect_hotspots(rise, noise_u=fields["temperature_rise_noise_u"]):
-        if all(np.hypot(spot.x_mm - one["x_mm"], spot.y_mm - one["y_mm"]) > one["size_mm"][0] / 2 for one in unnamed):
+        if all(np.hypot(spot.x_mm - one["x_mm"], spot.y_mm - one["y_mm"]) > reach for one, reach in surfaces):
             at = spot.cycle, np.abs(y - spot.y_mm).argmin(), np.abs(x - spot.x_mm).argmin()
             spots.append(replace(spot, masked=spot.masked or bool(hidden[at])))
     if "rise_scale_u" not in fields:

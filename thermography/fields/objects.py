@@ -29,7 +29,7 @@ _END_STRETCH = 2.0
 #: Fewest connected cells that are a part of the table.
 _LEAST_CELLS = 4
 #: A jump whose edge takes more than `_SHARP` of its size within this distance, mm, is no heat: in steel it spreads 100 mm in four minutes.
-_EDGE_MM, _SHARP = 10.0, 0.5
+EDGE_MM, _SHARP = 10.0, 0.5
 #: Share of the table from which a jump without such an edge is named: a reflection.
 _LEAST_SHARE = 0.02
 #: Largest share of the table that is left out; beyond it no field would remain.
@@ -111,8 +111,8 @@ def _ring(cells: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
 
 
 def _is_sharp(changed: Array, cells: NDArray[np.bool_], cell_mm: float) -> bool:
-    """Whether a change takes most of its size within `_EDGE_MM` along a row or a column of the cells."""
-    far = max(round(_EDGE_MM / cell_mm), 1)
+    """Whether a change takes most of its size within `EDGE_MM` along a row or a column of the cells."""
+    far = max(round(EDGE_MM / cell_mm), 1)
     near = scipy.ndimage.binary_dilation(cells, _EIGHT, iterations=far)
     values = np.where(near, changed, np.nan)
     steps = [np.abs(values[far:] - values[:-far]), np.abs(values[:, far:] - values[:, :-far])]
@@ -213,7 +213,7 @@ def describe_unnamed_surfaces(fields: xr.Dataset, parameters: CameraParameters) 
     """
     first = fields.isel(cycle=reference_cycle(fields["temperature"]))
     celsius, cell_mm = first["temperature"].values.astype(float), abs(float(fields["x"][1] - fields["x"][0]))
-    empty, far = np.isnan(celsius), max(round(_EDGE_MM / cell_mm), 1)
+    empty, far = np.isnan(celsius), max(round(EDGE_MM / cell_mm), 1)
     nearest = scipy.ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     filled, size = celsius[tuple(nearest)], 2 * round(_WIDEST_MM / cell_mm / 2) + 1
     # Beside empty cells, as those of discs, objects and edges of named surfaces, the lens mixes what they show into the table.

@@ -70,7 +70,7 @@ def test_an_object_and_an_unnamed_surface_are_no_hotspots(results_folder):
     fields["temperature_rise"] = fields["temperature_rise"] + 5.0 * near * (fields["cycle"] > 6)
     assert any(abs(spot.x_mm - 60.0) < 20.0 and abs(spot.y_mm - 130.0) < 20.0 for spot in describe_hotspots(fields))
     unnamed = fields.assign_attrs(unnamed_surfaces='[{"x_mm": 60.0, "y_mm": 130.0, "size_mm": [50.0, 40.0]}]')
-    assert not any(np.hypot(spot.x_mm - 60.0, spot.y_mm - 130.0) < 25.0 for spot in describe_hotspots(unnamed))
+    assert not any(np.hypot(spot.x_mm - 60.0, spot.y_mm - 130.0) < 42.0 for spot in describe_hotspots(unnamed))
     hidden = xr.where(near & (fields["cycle"] > 6), 64, 0).transpose("cycle", "y", "x").astype(np.uint8)
     fields["quality_flag"] = hidden
     after = describe_hotspots(fields)
