@@ -296,7 +296,10 @@ def _held_against_discs(
     pattern_u_K = np.sqrt(np.mean((shown.pattern_K - shown.pattern_K[0]) ** 2, axis=1))
     u_K = np.hypot(zero_u_K, np.interp(every, shown.index, pattern_u_K))
     part = camera.part.model_copy(update={"largest_u_K": float(u_K.max())})
-    return replace(camera, u_K=u_K, part=part, zero=share * zero), {**found, "zero_K": float(np.ptp(_without_noise(left)))}
+    return replace(camera, u_K=u_K, part=part, zero=share * zero), {
+        **found,
+        "zero_K": float(np.ptp(_without_noise(left))),
+    }
 
 
 def _without_noise(course: Array) -> Array:

@@ -183,7 +183,9 @@ def test_planted_faults_are_named_or_harmless(tmp_path, tally, seed, camera, siz
     """Every size on every view."""
     kind = KINDS[name]
     fault = kind.faults[size]
-    one = judge(tmp_path, camera, fault, kind.placed, 20 * seed + SIZES * VIEWS.index(camera) + size, shared=kind.shared)
+    one = judge(
+        tmp_path, camera, fault, kind.placed, 20 * seed + SIZES * VIEWS.index(camera) + size, shared=kind.shared
+    )
     named = bool(one.codes & (kind.codes | {"refused"})) and one.placed
     silent = one.beyond > BY_NOISE and not named
     tally.setdefault(name, []).append((named, silent, one.largest_K))

@@ -159,10 +159,11 @@ def _peaks(values: Array, noise: Array, cycle: int, least_prominence_K: float) -
     if not seen.all():
         nearest = scipy.ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
         field = np.where(seen, smooth, np.nextafter(smooth[tuple(nearest)], -np.inf))
-    # A Gaussian of width s leaves 1 / (4 pi s^2) of the variance of white noise; what it takes away shows how large that is. Where a part
-    # of its weight falls on no cell it leaves as much more.
+    # A Gaussian of width s leaves 1 / (4 pi s^2) of the variance of white noise; what it takes away shows how large that is: a cell's own
+    # weight in its mean is twice that, so that three such parts are missing. Where a part of its weight falls on no cell it leaves as
+    # much more.
     left = 1 / (4 * np.pi * _SMOOTHING_CELLS**2)
-    noise_K = MAD_TO_SIGMA * float(np.median(np.abs((values - smooth)[seen]))) / np.sqrt(1 - left)
+    noise_K = MAD_TO_SIGMA * float(np.median(np.abs((values - smooth)[seen]))) / np.sqrt(1 - 3 * left)
     cells_K = np.maximum(noise, noise_K)
     smoothed_K = cells_K * np.sqrt(left / np.maximum(weight, left))
     least = np.maximum(least_prominence_K, _LEAST_SIGNIFICANCE * smoothed_K)
