@@ -530,16 +530,6 @@ def test_a_sequence_that_never_rests_is_read_while_it_grows(tmp_path):
     assert sum(counts) == 8
 
 
-def test_only_the_new_part_of_a_sequence_is_read(tmp_path):
-    content = recording(tmp_path, 200)
-    camera, frame = arriving(tmp_path), len(content) // 200
-    (tmp_path / "a.seq").write_bytes(content[: 100 * frame])
-    camera.poll()
-    camera.poll()
-    following = camera._sequences[tmp_path / "a.seq"].following
-    assert following >= 99 * frame
-
-
 def test_a_picture_that_is_being_copied_waits(tmp_path):
     write_jpeg(tmp_path / "IR_1.jpg", np.full((12, 16), 18_000, np.uint16), PARAMETERS, START)
     content = (tmp_path / "IR_1.jpg").read_bytes()

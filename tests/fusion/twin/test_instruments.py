@@ -117,14 +117,6 @@ def test_environment_and_drivers_cover_the_test(campaign):
     assert rows[1].startswith("2026-03-09T06:30:00.000+00:00,")
 
 
-def test_same_recipe_writes_the_same_bytes(campaign, tmp_path):
-    again = simulate_campaign(campaign.parent.parent / "RECIPE.toml", tmp_path / "again")
-    names = sorted(p.relative_to(campaign.parent) for p in campaign.parent.rglob("*") if p.is_file())
-    assert len(names) == 8
-    for name in names:
-        assert (again.parent / name).read_bytes() == (campaign.parent / name).read_bytes(), name
-
-
 def test_empty_folder_is_used_and_progress_is_reported(tmp_path):
     (tmp_path / "out").mkdir()
     steps: list[tuple] = []

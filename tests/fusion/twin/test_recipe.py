@@ -27,20 +27,6 @@ def test_vary_changes_the_named_values_only():
     assert Recipe().vary(record={"hours": 2.0}).record == Record(hours=2.0)
 
 
-@pytest.mark.parametrize(
-    ("tables", "message"),
-    [
-        ({"test": {"feed_mm_per_min": 0.0}}, r"test\.feed_mm_per_min = 0\.0: input should be greater than 0"),
-        ({"plan": {"origin_mm": (1.0, 2.0, 3.0)}}, r"plan\.origin_mm = \[1\.0, 2\.0, 3\.0\]: it takes 2 values, not 3"),
-        ({"camera": {"file": "png"}}, r"camera\.file = \"png\": input should be 'jpg' or 'seq'"),
-        ({"anomaly": (AnomalyRecipe(1), AnomalyRecipe(2, "odd"))}, r'^anomaly\.1\.kind: anomaly\.kind = "odd"'),
-    ],
-)
-def test_recipe_made_in_python_is_checked_like_a_file(tables, message):
-    with pytest.raises(RecipeError, match=message):
-        check_recipe(Recipe().vary(**tables))
-
-
 # A recipe is read as it is meant, or refused with file, key, value and remedy.
 
 
@@ -138,14 +124,6 @@ def test_library_holds_every_effect_that_the_analysis_names():
     periodic_disturbance pitch_error camera_offset reflected_source laser_warm_up sensor_fault"""
     outside = {"telegraph_switching", "travelling_chirp", "local_creep", "direction_scale"}
     assert set(EFFECTS) == set(named.split()) | outside
-
-
-def test_all_faults_of_a_recipe_are_named_together(tmp_path):
-    text = "[test]\ncycles = 0\nfeed_mm_per_min = '300'\n[duty]\nkind = 'wild'"
-    with pytest.raises(RecipeError) as refused:
-        read_recipe(write(tmp_path, text))
-    keys = ("test.cycles = 0", 'test.feed_mm_per_min = "300"', "duty.kind")
-    assert all(key in str(refused.value) for key in keys)
 
 
 def test_the_schema_accepts_every_recipe_of_the_project_and_refuses_what_the_reader_refuses() -> None:
