@@ -3,7 +3,6 @@
 import shutil
 
 import numpy as np
-import pytest
 import xarray as xr
 
 from fusion.app.live import (
@@ -18,7 +17,6 @@ from fusion.app.live import (
     standing,
 )
 from fusion.app.parts import State
-from fusion.campaign.config import CampaignError
 from fusion.pipeline.watch import Enough, FinishedCycle, LiveState
 from tests.fusion.app.texts import texts
 from tests.fusion.campaign_parts import keep_cycles
@@ -69,11 +67,6 @@ def test_a_running_test_is_followed_until_it_is_ended(copied, tmp_path):
     assert not session.runs and session.fault == ""
     assert [one.number for one in session.course.cycles] == [1, 2, 3, 4, 5, 6]
     assert session.course.readings == 72 and session.course.with_field is None and session.version > 0
-
-
-def test_a_campaign_file_that_cannot_be_used_is_refused(tmp_path):
-    with pytest.raises(CampaignError, match="no such campaign file"):
-        LiveSession(tmp_path / "campaign.toml", wanted_u_um=0.1)
 
 
 def test_charts_say_what_is_seen_and_nothing_is_drawn_before_a_cycle_is_finished():

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import TypeAdapter
 
 from fusion.campaign import values as value_types
 from fusion.campaign.values import (
     QuantityError,
+    conversion,
     matching_files,
     read_option,
     read_quantity,
     stored_path,
+    unit_name,
 )
 
 
@@ -50,6 +54,11 @@ def test_anything_else_is_refused_with_an_example(value: object, message: str) -
     assert str(error.value) == message
 
 
+def test_a_temperature_has_an_offset() -> None:
+    assert conversion("K", "degC") == (1.0, -273.15)
+    assert unit_name(" \u2103 ") == "degC" and unit_name("furlong") == "furlong"
+
+
 def test_an_option_is_named_with_what_was_written() -> None:
     assert read_option("--spacing", "2 cm", "mm") == 20.0
     with pytest.raises(QuantityError, match=r'^--spacing "0": a length needs its unit in the value; write for example'):
@@ -57,6 +66,25 @@ def test_an_option_is_named_with_what_was_written() -> None:
 
 
 # Tests of the types of values: what is written, the number in the unit of the name, and the sentence about what cannot be.
+
+
+@pytest.mark.parametrize(
+    ("name", "written", "value"),
+    [
+        ("Millimetres", "2 cm", 20.0),
+        ("Metres", "1.2 m", 1.2),
+        ("Celsius", "295.15 K", 22.0),
+        ("PositiveSeconds", "5 min", 300.0),
+        ("PartsPerMillion", "11.7 ppm/K", 11.7),
+        ("Fraction", "45 %", 0.45),
+        ("KelvinU", "20 mK", 0.02),
+        ("TimeZone", "Europe/Vienna", "Europe/Vienna"),
+        ("PixelPatch", [8, 8, 24, 16], (8, 8, 24, 16)),
+    ],
+)
+def test_a_value_comes_in_the_unit_of_its_name(name: str, written: Any, value: Any) -> None:
+    read = TypeAdapter(getattr(value_types, name)).validate_python(written)
+    assert read == (pytest.approx(value) if isinstance(value, float) else value)
 
 
 @pytest.mark.parametrize("pattern", ["/**/*", "/**/*.jpg", "/*/**/*.jpg", "../" * 20 + "**/*.seq"])

@@ -30,19 +30,6 @@ def test_the_old_file_stays_until_the_new_one_is_whole_and_on_the_disk(tmp_path,
     assert steps == (["old", "new"] if os.name == "posix" else ["old"])
 
 
-def test_a_full_disk_leaves_the_old_file_alone(tmp_path):
-    path = tmp_path / "fields.nc"
-    path.write_text("old")
-
-    def fill(temporary):
-        temporary.write_text("ne")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with pytest.raises(OSError, match="No space left"):
-        write_atomically(path, fill)
-    assert (path.read_text(), partial_path(path).exists()) == ("old", False)
-
-
 @pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "full"), KeyboardInterrupt()])
 def test_folders_that_were_created_for_a_file_go_with_it(tmp_path, fault):
     (tmp_path / "a").mkdir()

@@ -19,7 +19,6 @@ from fusion.report.exports.controls import (
     read_active,
     read_profile,
     read_twincat,
-    siemens840d,
     siemens_temperature,
     tabulate,
     twincat,
@@ -123,14 +122,6 @@ def test_values_of_twincat_are_those_of_its_makers_example():
     )
     np.testing.assert_allclose(at, [0.0, 10.0])
     np.testing.assert_allclose(deviation, [[0.0, 7e-4], [0.0, 7e-4]])
-
-
-def test_comments_and_areas_of_siemens():
-    table = tabulate(PROFILE, spacing_mm=15.0)
-    text = siemens840d(table, "AX3", ["first", "second"])
-    assert text.splitlines()[:3] == ["%_N_AX3_EEC_INI", "; first", "; second"]
-    code = [line for line in text.splitlines()[1:] if not line.startswith(";")]
-    assert code[0] == "CHANDATA(1)" and all(line.startswith("$AA_ENC_COMP") for line in code[1:-1])
 
 
 def origin_of(active: str, campaign_file: str = "") -> Origin:
@@ -339,12 +330,6 @@ def test_scatter_of_few_cycles_is_drawn_together_where_it_differs_by_chance(smal
     assert np.ptp(scatter) < 0.5 * np.ptp(own) and np.sqrt(np.mean(scatter**2)) == pytest.approx(0.05, rel=0.15)
     far = drift["scatter"].where(drift["target"] != 3, 1.0)
     assert scatter_and_drift(drift.assign(scatter=far))[0].max() > 0.8
-
-
-def test_a_coarse_table_leaves_more_and_says_so(small_run):
-    profile = read_profile(read_grouped(small_run / "deviations.nc"))
-    coarse = predict(profile, tabulate(profile, spacing_mm=60.0), one_table=False)
-    assert coarse["resampling_um"] > 0.5 and coarse["own_um"] > 0.5
 
 
 def line_of(folder):
