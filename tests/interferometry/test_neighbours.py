@@ -57,6 +57,14 @@ def test_student_below_thirty_repetitions():
     assert float(coverage_factor(np.array(29))) == pytest.approx(stats.t.ppf(0.97725, 28), abs=1e-3)
 
 
+def test_conventional_s_is_drift_and_differenced_s_is_not(rng):
+    deviations, _ = simulate(rng)
+    assert float(evaluate_conventional(deviations)["standard_deviation"].mean()) > 2.0
+    single = evaluate_neighbours(deviations)["position_standard_deviation"]
+    # Random part 0.4 um, plus the stretch between neighbours, which differencing does not remove.
+    assert 0.38 < float(single.mean()) < 0.47
+
+
 def test_three_standard_deviations_side_by_side(rng):
     deviations, _ = simulate(rng)
     table = compare(deviations, estimate_drift(deviations)).sel(direction="positive")

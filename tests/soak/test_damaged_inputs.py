@@ -41,7 +41,7 @@ def judged(kinds: list[Kind], folder: Path, *, inputs: int, seed: int) -> list[s
 
 def test_some_damaged_inputs_of_every_kind(tmp_path: Path) -> None:
     """The quick form: it finds what happens often."""
-    assert not judged(kinds_of_inputs(tmp_path), tmp_path, inputs=300, seed=7)
+    assert not judged(kinds_of_inputs(tmp_path), tmp_path, inputs=150, seed=7)
 
 
 @pytest.mark.slow

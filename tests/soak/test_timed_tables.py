@@ -19,7 +19,7 @@ pytestmark = pytest.mark.long
 
 def test_some_tables_whose_times_are_text(tmp_path: Path) -> None:
     """The quick form."""
-    assert not judged(kinds_of_timed_tables(), tmp_path, inputs=150, seed=7)
+    assert not judged(kinds_of_timed_tables(), tmp_path, inputs=60, seed=7)
 
 
 @pytest.mark.slow

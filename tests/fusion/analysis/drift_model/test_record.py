@@ -38,6 +38,7 @@ from tests.fusion.record_tables import SPINDLE, record_of, spindle_table
 pytestmark = pytest.mark.long
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_the_spindle_heat_of_a_real_machine_is_found_and_predicts_the_next_load_cycle(
     tmp_path: Path, real_file: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
