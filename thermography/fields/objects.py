@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -13,12 +13,14 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from thermography.common import MAD_TO_SIGMA, ZERO_CELSIUS_K, Array
-from thermography.fields.blocks import Block, BlockResult, FrameSeries, Registrations
 from thermography.fields.cycle_fields import OBJECT, reference_cycle
 from thermography.io.frame import CameraParameters
 from thermography.io.sequence import WindowReader
 from thermography.large_arrays import median_of_pieces, piece_slices
 from thermography.radiometry.planck import black_body_signal, calibrate
+
+if TYPE_CHECKING:
+    from thermography.fields.blocks import Block, BlockResult, FrameSeries, Registrations
 
 #: A cell jumps if its change from one frame to the next exceeds its changes before and after by more than this, K, ...
 JUMP_K = 0.3
