@@ -222,8 +222,9 @@ def run(
         # For a run that is whole the libraries of the analysis are not loaded.
         kept = [_read_whole(*one) if resume and not watch else None for one in folders]
         two = processes > 1 and not watch and None in kept
-        if two:
-            import_module("fusion.pipeline.run")
+        # What both processes need is loaded before there are two.
+        for name in ("fusion.pipeline.run", "numba") if two else ():
+            import_module(name)
         report("start", 1, 1)
     with second_process(wanted=two) as worker, _answering(written):
         if watch:
