@@ -6,7 +6,6 @@ import base64
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import xarray as xr
 
@@ -123,6 +122,8 @@ def _table_of_pictures(thermograms: xr.Dataset, zone: str | None) -> Table:
 
 def _jpeg(pixels: np.ndarray) -> str:
     """Return a picture as the address of an image in the page."""
+    import cv2  # a report without a camera's pictures does without it
+
     encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
