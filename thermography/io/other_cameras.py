@@ -948,7 +948,8 @@ def _is_a_frame(block: NDArray[np.floating]) -> bool:
 
 def _count(rows: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Whether each row counts in steps of one from 0 or 1 on, behind a first field."""
-    return (np.diff(rows[:, 1:]) == 1.0).all(axis=1) & np.isin(rows[:, 1], (0.0, 1.0, 2.0))
+    with np.errstate(invalid="ignore"):
+        return (np.diff(rows[:, 1:]) == 1.0).all(axis=1) & np.isin(rows[:, 1], (0.0, 1.0, 2.0))
 
 
 def _fields(line: str, delimiter: str) -> list[str]:

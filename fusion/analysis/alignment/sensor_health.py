@@ -625,13 +625,16 @@ def _moved_alone(grid: Grid, sensor: int, others: list[int], inside: NDArray[np.
     """Whether the prediction of a sensor, as learnt elsewhere, moves while it stands still, beyond what the prediction misses elsewhere."""
     if not others:
         return False
-    changes = predicted_changes(grid, sensor, others, grid.durations()[-1], apart_from=inside)
-    within = inside[changes.before] & inside[changes.after]
-    elsewhere = ~(inside[changes.before] | inside[changes.after])
-    if not within.any() or elsewhere.sum() < _LEAST_REPEATED:
-        return False
-    missed = max(float(np.quantile(np.abs(changes.residual[elsewhere]), 0.95)), changes.least_K)
-    return bool(np.abs(changes.residual[within]).max() > _MOVES * missed)
+    # The longest changes are few, so that their prediction is learnt worst: the duration at which it is good is not known before.
+    for duration in grid.durations():
+        changes = predicted_changes(grid, sensor, others, duration, apart_from=inside)
+        within = inside[changes.before] & inside[changes.after]
+        elsewhere = ~(inside[changes.before] | inside[changes.after])
+        if within.any() and elsewhere.sum() >= _LEAST_REPEATED:
+            missed = max(float(np.quantile(np.abs(changes.residual[elsewhere]), 0.95)), changes.least_K)
+            if np.abs(changes.residual[within]).max() > _MOVES * missed:
+                return True
+    return False
 
 
 @dataclass(frozen=True)

@@ -634,7 +634,7 @@ class LoopResult:
             "separable": self.separable,
             "wandering_um": self.wandering_um,
             "warm_up_only": self.warm_up_only,
-            "drift_um": float(np.sqrt(np.nanmean(np.sum(self._drift, axis=0) ** 2))),
+            "drift_um": self._drift_um,
             "followed": self._followed[0],
             "tracking": self.tracking,
             "left_out_of_forecast": tuple(self.steps[place].effect for place in sorted(self.away)),
@@ -652,6 +652,11 @@ class LoopResult:
     @abstractmethod
     def _drift(self) -> list[Array]:
         """What every term of the final model makes of the drift, and last what is left, (n,) or (n, channels) about their means, um."""
+
+    @property
+    def _drift_um(self) -> float:
+        """Root mean square of the drift about its means, um."""
+        return float(np.sqrt(np.nanmean(np.sum(self._drift, axis=0) ** 2)))
 
     @property
     def _followed(self) -> tuple[list[schema.DriftShare], float]:
@@ -673,7 +678,9 @@ class LoopResult:
         left = self.remainder
         shape = left.shape or (BEYOND_PLAIN if self._falls_short else "")
         # The held-out error of a drift that is carried on at its rate says nothing of the size of what drifts.
-        size = max(left.rms_um or excess_um(self._errors_um["final"], self.noise_floor_um), self.wandering_um)
+        # A model that cancels a part of the random drift leaves no more than all of the drift.
+        wandering_um = min(self.wandering_um, self._drift_um)
+        size = max(left.rms_um or excess_um(self._errors_um["final"], self.noise_floor_um), wandering_um)
         # What a step without a name describes is not explained either, whether a shape is left beside it or not.
         nameless = [step.rms_um or 0.0 for step, kept in zip(self.steps, self._kept, strict=True) if not kept]
         size = float(np.linalg.norm([size if shape else 0.0, *nameless]))

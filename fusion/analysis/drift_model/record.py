@@ -528,6 +528,14 @@ def _smoothed(record: Record, values: Array, minutes: float) -> Array:
     return np.asarray((total[last] - total[first]) / (last - first))
 
 
+def sensors_at_once(record: Record) -> Candidate:
+    """What every sensor would read with less noise, its mean over three blocks, and without delay, the rate of that beside it."""
+    quiet = np.column_stack([_smoothed(record, one, 0.0) for one in record.rise.T])
+    rate = np.diff(quiet, axis=0, prepend=quiet[:1])
+    rate[list(record.first)] = 0.0
+    return Candidate(np.hstack([quiet, rate]), {}, ("um/K",) * (2 * len(record.sensors)))
+
+
 def one_switching_share(driver: Array) -> float:
     """Share of a driver's variance that the best single step explains."""
     n = driver.size
@@ -541,6 +549,8 @@ def one_switching_share(driver: Array) -> float:
 MAX_ERROR_RATIO_TO_ENTER = 0.98
 #: An event may make that error larger by this factor: chance, not harm.
 MAX_ERROR_RATIO_OF_EVENT = 1.01
+#: Share of its gain that an event keeps beside what late and noisy sensors miss: less is their delay, where an unlogged load was switched.
+_BESIDE_SENSORS = 0.5
 RecordState = LoopState[RecordFit]
 
 
@@ -575,8 +585,13 @@ class RecordProblem(Problem[RecordFit]):
         """The state with the events of the training part, those that explain most first."""
         found, decisions = find_events(self.record, self.train)
         error_um, scores = self.predict(state.model.terms).chained_rmse, []
+        both = state.model, self.beside_sensors(state.model) if found else state.model
         for event in found:
-            gain = float(channel_gains(state.model, [event]).gain[0, 0])
+            gain, beside = (float(channel_gains(one, [event]).gain[0, 0]) for one in both)
+            if beside < _BESIDE_SENSORS * gain:
+                evidence = {"gain": beside, "needed": _BESIDE_SENSORS * gain}
+                decisions = [*decisions, Decision(step_event.name, Reason.SENSORS_MISS, evidence)]
+                continue
             after_um = self.predict([*state.declared, Term(step_event.name, event)]).chained_rmse
             ranges = {"time_s": event.onset.ends(), "duration_min": event.duration.ends(60.0)}
             confirmed = Confirmation(True, Confirmed.RAW_READINGS, error_um=after_um)
@@ -589,6 +604,12 @@ class RecordProblem(Problem[RecordFit]):
             model = self.refit(state.model, [*state.model.terms, Term(score.name, score.best)])
             state = state.entered(model, score, Confirmed.RAW_READINGS)
         return state
+
+    def beside_sensors(self, model: RecordFit) -> RecordFit:
+        """A model with all that late and noisy sensors miss, where it follows sensors."""
+        if all(term.effect != QUASI_STATIC for term in model.terms):
+            return model
+        return self.refit(model, [*model.terms, Term("", sensors_at_once(self.record))])
 
     def refit(self, model: RecordFit, terms: Sequence[Term]) -> RecordFit:
         """Fit other terms to the blocks that a model was fitted to."""
@@ -620,6 +641,11 @@ class RecordProblem(Problem[RecordFit]):
                 score.name, Reason.WITHIN_DIGITS, {"range_um": float(moved[largest]), "step_um": float(step[largest])}
             )
         excited_by = self.effects[score.name].excited_by if score.name in BUILT_IN else ""
+        # What follows the parts of late and noisy sensors at once is a fast state of whatever heats these.
+        if excited_by == "driver":
+            gain = float(channel_gains(self.beside_sensors(model), [score.best]).gain[0, 0])
+            if gain < score.critical:
+                return Decision(score.name, Reason.SENSORS_MISS, {"gain": gain, "needed": score.critical})
         return refuse(score.name, excited_by, score.best, RecordGrounds(model))
 
     def confirm(self, score: Score, state: RecordState) -> Score:

@@ -50,6 +50,7 @@ class Reason(StrEnum):
     FOLLOWS_RATE = "follows the rate"
     SMOOTHING = "smoothing"
     UNLOGGED_HEAT = "unlogged heat"
+    SENSORS_MISS = "what the sensors miss"
     WITHIN_DIGITS = "within the digits"
     NOT_CONFIRMED = "not confirmed"
     NOT_PREDICTED = "later parts not predicted better"

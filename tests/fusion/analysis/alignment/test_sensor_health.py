@@ -46,6 +46,16 @@ def test_sound_sensors_are_left_alone(sound):
     assert examine_sensors(seconds[:50], temperature[:50]) == []
 
 
+def test_a_sensor_without_noise_that_repeats_one_reading_is_named_by_what_its_neighbours_do(sound):
+    """Its digits come five times in a row, so that neither runs nor noise say anything; its changes within minutes are well predicted."""
+    seconds, temperature, load = sound
+    held = temperature.copy()
+    held[:, 0] = np.round(np.repeat(temperature[::5, 0], 5) / 0.05) * 0.05
+    held[900:, 0] = held[900, 0]
+    (fault,) = examine_sensors(seconds, held, load)
+    assert (fault.sensor, fault.kind) == (0, Kind.STUCK)
+
+
 def ramp(seconds: np.ndarray, begin: int, minutes: float) -> np.ndarray:
     return np.clip((seconds - seconds[begin]) / (60.0 * minutes), 0.0, 1.0)
 

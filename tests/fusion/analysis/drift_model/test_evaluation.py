@@ -387,6 +387,9 @@ def test_the_nearest_effect_to_what_is_left_is_one_that_was_not_added():
     assert (told.shape, told.rms_um, told.p_value) == ("a shape", 0.2, 0.5)
     wandering = replace(result(looped, shaped), wandering_um=0.6)
     assert wandering.described(UNTESTED).unexplained.rms_um == 0.6
+    # No more is left than the whole drift.
+    every = replace(wandering, wandering_um=60.0).described(UNTESTED)
+    assert every.unexplained.rms_um == every.drift_um < 60.0
     # So is what a step describes that has no name.
     (step,) = wandering.steps
     nameless = replace(wandering, steps=[step.model_copy(update={"withheld": "its period is open"})])
