@@ -70,7 +70,7 @@ def _real_path(name: str) -> Path:
 
 
 def _spindle() -> pd.DataFrame:
-    table = pd.read_excel(_real_path(_SPINDLE))
+    table = pd.read_excel(_real_path(_SPINDLE), engine="openpyxl")
     return table.rename(columns={table.columns[0]: "time (s)"})
 
 

@@ -581,7 +581,9 @@ def _stuck(
         values = temperature[known, k]
         length, first, ordinary = _longest_run(values)
         rest = np.delete(values, slice(first, first + length))
-        if length < max(_LEAST_REPEATED, limit * max(ordinary, _by_chance(rest == values[first]))):
+        # What holds from the first reading on and moves later was at rest: no fault is seen to begin.
+        rests = first == 0 and length < values.size
+        if rests or length < max(_LEAST_REPEATED, limit * max(ordinary, _by_chance(rest == values[first]))):
             continue
         run = known[first : first + length]
         others = [j for j in kept if j != k]

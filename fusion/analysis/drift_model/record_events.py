@@ -162,6 +162,7 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
     cells, found, decisions, every = _Cells.of(samples, inside), list[Event](), list[Decision](), list[Event]()
     if cells is None:
         return [], []
+    left_out = np.zeros(len(record.channels), bool)
     while (seen := cells.most_striking() or cells.most_likely()) is not None:
         if load := cells.load_that_changes(seen):
             evidence: dict[str, float | str] = {"name": load, "hours": float(cells.seconds[seen.at]) / 3600.0}
@@ -178,12 +179,17 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
         found.append(event)
         every.append(event)
         cells.take_out(event)
-        many = np.sum([one.size != 0.0 for one in found], axis=0) > MOST_OF_A_CHANNEL
+        many, course = np.sum([one.size != 0.0 for one in found], axis=0) > MOST_OF_A_CHANNEL, _is_a_course(found)
+        evidence = {"most": MOST_OF_A_CHANNEL, "search_p": event.p_value}
         if many.any():
-            evidence = {"most": MOST_OF_A_CHANNEL, "search_p": event.p_value}
             decisions.append(Decision("step_event", Reason.TOO_MANY_EVENTS, evidence))
-            cells.leave_out(many)
-            found = [replace(one, size=np.where(many, 0.0, one.size)) for one in found if one.size[~many].any()]
+        if course.any():
+            decisions.append(Decision("step_event", Reason.OWN_COURSE, evidence))
+        if (nameless := many | course).any():
+            cells.leave_out(nameless)
+            left_out |= nameless
+            found = [replace(one, size=np.where(left_out, 0.0, one.size)) for one in found]
+            found = [one for one in found if one.size.any()]
     found, times = _lasting(found), [one.onset.value for one in _lasting(every)]
     p, name = cells.load_behind(times) if len(times) > 1 else (1.0, "")
     if found and p < RECORD_ENTRY_LEVEL:
@@ -192,12 +198,12 @@ def find_events(record: Record, used: NDArray[np.bool_]) -> tuple[list[Event], l
     if not found:
         return [], decisions
     left = cells.response - cells.moved @ cells.slopes[cells.windows()[-1]]
-    spread = np.nanvar(left[:, ~many], axis=0) + np.finfo(float).tiny
+    spread = np.nanvar(left[:, ~left_out], axis=0) + np.finfo(float).tiny
     number = np.maximum(np.bincount(samples.block, minlength=used.size), 1)
     # On a block an event is the mean of its course over the readings there.
     laid = [np.bincount(samples.block, one.course.at(samples.seconds), used.size) / number for one in found]
     found = [replace(one, columns=course[:, None]) for one, course in zip(found, laid, strict=True)]
-    return sorted(found, key=lambda one: -float(np.max(one.size[~many] ** 2 / spread))), decisions
+    return sorted(found, key=lambda one: -float(np.max(one.size[~left_out] ** 2 / spread))), decisions
 
 
 @dataclass
@@ -775,6 +781,18 @@ class _Look:
         return Answer(
             slope, float(np.hypot(other_u, slope * u)) / abs(size), self.seconds.size // 2, where=_EVERY_OTHER
         )
+
+
+def _is_a_course(events: list[Event]) -> NDArray[np.bool_]:
+    """Channels (channels,) in which changes without a sudden part lie over one another: a smooth course can be made of any such."""
+    slow = sorted((one for one in events if one.duration.value and not one.course.at_once), key=lambda one: one.onset)
+    over = np.zeros(events[0].size.size, bool)
+    for place, one in enumerate(slow):
+        ends = one.onset.value + one.duration.value
+        over |= np.any(
+            [(one.size != 0.0) & (two.size != 0.0) for two in slow[place + 1 :] if two.onset.value < ends], axis=0
+        )
+    return over
 
 
 def _lasting(events: list[Event]) -> list[Event]:

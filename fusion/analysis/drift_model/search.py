@@ -59,6 +59,7 @@ class Reason(StrEnum):
     SUPERFLUOUS = "superfluous"
     TOO_MANY_EVENTS = "too many events"
     UNLOGGED_LOAD = "unlogged load"
+    OWN_COURSE = "a course of its own"
     INCONSISTENT_PATTERN = "inconsistent pattern"
     SHARED_PATTERN = "shared pattern"
     DEPENDS_ON_WITHDRAWN = "depends on a withdrawn effect"
@@ -75,7 +76,7 @@ FINAL = frozenset(
     {Reason.INCONSISTENT_PATTERN, Reason.SHARED_PATTERN, Reason.DEPENDS_ON_WITHDRAWN, Reason.NOT_REPEATED}
 )
 #: Reasons for which an effect that had entered was taken out again without another doing its work.
-WITHDRAWN = FINAL | {Reason.TOO_MANY_EVENTS, Reason.UNLOGGED_LOAD}
+WITHDRAWN = FINAL | {Reason.TOO_MANY_EVENTS, Reason.UNLOGGED_LOAD, Reason.OWN_COURSE}
 #: Reasons for which a significant effect has no name: it shows that something is missing all the same.
 WITHHELD = (BLOCKING - {Reason.COLLINEAR, Reason.WITHIN_DIGITS}) | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED}
 
