@@ -41,7 +41,7 @@ def test_sound_clocks_pass(effect: str) -> None:
     assert all(one.identical(before) for one, before in zip(inputs, kept, strict=True))
 
 
-@pytest.mark.parametrize(("name", "minutes"), zip(FILES, (-60.0, 15.0, 120.0, -15.0), strict=True))
+@pytest.mark.parametrize(("name", "minutes"), [*zip(FILES, (-60.0, 15.0, 120.0, -15.0), strict=True)])
 def test_the_odd_clock_is_named_and_no_other(name: str, minutes: float) -> None:
     found = clocks(with_late(recorded(), name, minutes), drift=False)
     assert [code for code, check in found.items() if not check.passed] == [f"{name}_clock"]
