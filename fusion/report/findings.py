@@ -85,7 +85,7 @@ def first_screen(results: Results, report: Mapping[str, Any], axis: str, begun: 
         "answers": _told(
             {
                 "Decision": decision,
-                "Acceptance": "" if iso is None else say("unmet", iso),
+                "Acceptance": say("unmet", iso) if iso is not None and iso.tolerances else "",
                 "Temperature" if alone else "Cause": _if_so(say("why", results)),
                 "Map": "" if results.field is None else say("map_in_brief", results.field),
                 "Place": _if_so(say("place_in_brief", results)),
@@ -291,7 +291,8 @@ def findings(results: Results) -> list[Finding]:
         largest, _ = drift_extremes(drift)
         add("drift", of=largest, tile="Largest drift", value=largest.size, unit="um")
     if results.field is not None:
-        add("mean_rise", of=results.field, tile="Table, mean rise")
+        # Beside the values of an axis the largest rise says enough.
+        add("mean_rise", of=results.field, tile="" if results.iso230 else "Table, mean rise")
     elif pictures is not None:
         own = [one for one in regions if one.camera == pictures.series] or regions
         for code, name in (("highest", "Highest"), ("lowest", "Lowest"), ("mean", "Mean")):
@@ -377,12 +378,10 @@ def _printed(results: Results, rows: list[tuple[str, str]], **looks: Any) -> ric
 def brief_rows(results: Results) -> list[tuple[str, str]]:
     """Return names and texts of what the first screen of the report says."""
     first = first_screen(results, {}, "", "")
-    # The largest rise stands above.
-    shown = [one.tile for one in findings(results) if one.tile and (one.code != "mean_rise" or results.iso230 is None)]
+    shown = [one.tile for one in findings(results) if one.tile]
     figures = "; ".join(f"{tile.name.removesuffix(', ISO 230-2')} {tile.value}" for tile in shown)
-    doubt, *_ = first["open"].split(". Assumed")
     rows = {
-        "In doubt": doubt,
+        "Inputs": first["open"],
         **first["answers"],
         "Figures": figures,
         "Next": _numbered(first["next"][:_PRINTED_STEPS]),

@@ -243,7 +243,7 @@ def test_a_record_is_explained_corrected_and_followed_by_the_next_test(spindle: 
     assert written["loop"]["rmse_final_um"] < 0.2 * written["loop"]["rmse_declared_um"]
     assert written["loop"]["verdict"] == "partial"
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "lacks a heat source that no sensor sees" in page
+    assert "lacks an unseen heat source" in page
     with xr.open_dataset(out / "fusion.nc", engine="h5netcdf") as product:
         assert {"displacement", "predicted_final", "contribution", "sealed"} <= set(product.data_vars)
     again = invoke("run", day, "--out", out, "--resume")

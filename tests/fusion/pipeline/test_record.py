@@ -54,7 +54,7 @@ def test_gaps_missing_displacements_sensors_and_drivers_are_noted():
     assert told["record_channels_left_out"] == "Displacements that cannot be modelled are left out: ch3 never moves."
     told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
     assert told["record_sensors_dependent"] == "Left out because they duplicate other sensors: t2; t3."
-    assert told["no_drivers"].startswith("The record has no driver that changes, so a heat source that no sensor sees")
+    assert told["no_drivers"].startswith("The record has no driver that changes, so an unseen heat source")
 
 
 @pytest.mark.parametrize(("longer_s", "pauses"), [(150.0, 0), (151.0, 1)])

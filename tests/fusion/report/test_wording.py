@@ -190,7 +190,7 @@ def results(found: Loop | None, **parts: Any) -> Results:
             loop("partial", step("dead_path"), step("air_index", confirmed=False, borne_out="no")),
             [
                 "lacks the laser's dead path.",
-                "What is left, 0.20 µm rms, what was added without a name included, has no cause",
+                "The rest, 0.20 µm rms, what was added without a name included, is unexplained",
             ],
         ),
         (
@@ -199,13 +199,13 @@ def results(found: Loop | None, **parts: Any) -> Results:
         ),
         (
             loop("unexplained", shape="a wave"),
-            ["predicted to 0.66 µm (last", "What is left, 0.20 µm rms, has no cause that can be identified."],
+            ["predicted to 0.66 µm (last", "The rest, 0.20 µm rms, is unexplained."],
         ),
         (
             loop("unexplained", step("dead_path"), separable=False),
             ["with lags predict it to 0.31 µm; a cause is not separable."],
         ),
-        (loop("unexplained"), ["has no cause that can be identified"]),
+        (loop("unexplained"), ["is unexplained"]),
         (loop("no_skill"), ["repeating the last cycle or the mean"]),
         (None, ["without a model"]),
     ],
@@ -243,7 +243,7 @@ def test_what_is_left_is_told_with_what_it_resembles():
         closest_effect_share=0.99, closest_effect_parameters={"follows": "duty"},
     )  # fmt: skip
     told = answers.headline(results(loop("unexplained", unexplained=left)))
-    assert "resembles a heat source that no sensor sees (follows duty, 99 % of its variance), without" in told
+    assert "resembles an unseen heat source (follows duty, 99 % of its variance), without" in told
     assert "p = 0.06" in say("what_remains", results(loop("unexplained", unexplained=left)))
     far = left.model_copy(update={"closest_effect_share": 0.4})
     assert "resembles" not in answers.headline(results(loop("unexplained", unexplained=far)))
@@ -451,9 +451,8 @@ JUMP = axis_step("step_event", event_cycle=38, event_time="2026-03-09T09:08:00Z"
 
 def test_what_an_effect_follows_is_told_with_its_time_constant():
     assert step_phrase(SOURCE, None, record=False) == (
-        "a heat source that the camera does not see (follows the logged duty, time constant 13 min [11 to 15])"
+        "an unseen heat source (follows the logged duty, time constant 13 min [11 to 15])"
     )
-    assert "no sensor sees" in step_phrase(SOURCE, None, record=True)
     lagging = axis_step("thermal_lag", parameters={"time_constant_min": 30.0})
     assert step_phrase(lagging, None, record=False).endswith("(time constant 30 min)")
     assert step_phrase(axis_step("bed_bending"), None, record=False) == "bed bending"
@@ -463,7 +462,7 @@ def test_effects_that_are_not_separated_are_told_as_one_of_these():
     tied = axis_step("unseen_heat_source", tied=("thermal_lag",), parameters={"follows": "duty"})
     told = say("verdict", loop("explained", tied), None, False)
     assert (
-        "lacks one of these, which these data do not separate: a heat source that the camera does not see (follows"
+        "lacks one of these, which these data do not separate: an unseen heat source (follows"
         in told
     )
     assert "or a part of the machine that follows the measured temperatures with a lag" in told
