@@ -812,6 +812,7 @@ def compare(
     exit code is 0 where the table acted as it states and the machine did not change, else 1.
     """
     from fusion.pipeline.compare import compare_campaigns
+    from fusion.pipeline.iso230 import sheet_of_run
     from fusion.report.charts.comparison import follow_trends
     from fusion.report.comparison import (
         achieved_table,
@@ -832,7 +833,7 @@ def compare(
     with _answering():
         pairs = compare_campaigns(results, same_setup=same_setup, applied=applied)
         if out is not None:
-            write_page(out, render_comparison(pairs))
+            write_page(out, render_comparison(pairs, own=sheet_of_run(results[-1])))
             errors.print(f"page: {out.resolve()}")
         if as_json:
             print_json(comparison_json(pairs))

@@ -103,8 +103,6 @@ def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> N
             page.set_default_timeout(_LOADING_MS)
             page.get_by_text("Results", exact=True).first.click()
             page.get_by_text("Open", exact=True).first.click()
-            # The report is laid out first: a click before that is lost.
-            page.wait_for_timeout(8000)
             page.get_by_role("button", name="Map", exact=True).click()
             page.get_by_text("largest at x").first.wait_for()
             page.wait_for_timeout(8000)

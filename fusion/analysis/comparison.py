@@ -784,7 +784,7 @@ def _coefficients(before: ComparedCampaign, after: ComparedCampaign) -> Iterator
     first, second = ({*loop.declared, *(step.effect for step in loop.steps)} for loop in models)
     if first != second:
         more = (", ".join(sorted(effects)).replace("_", " ") for effects in (first - second, second - first))
-        yield Lack("effects", tuple(effects or "nothing more" for effects in more))
+        yield Lack("effects", tuple(effects or "nothing of its own" for effects in more))
         return
     found = [_per_kelvin(loop) for loop in models]
     for name in found[0]:

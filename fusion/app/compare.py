@@ -12,6 +12,7 @@ from fusion.app import parts as ui
 from fusion.campaign.values import in_order
 from fusion.common import FusionError
 from fusion.pipeline.compare import compare_campaigns
+from fusion.pipeline.iso230 import sheet_of_run
 from fusion.report.comparison import render_comparison
 from fusion.results.results import read_results
 from fusion.results.store import write_atomically
@@ -112,7 +113,7 @@ class CompareScreen:
 
 def write_comparison(folders: list[Path], *, same_setup: bool) -> Path:
     """Write the page of a comparison into the results folder of the reference, in place of the one before."""
-    page = render_comparison(compare_campaigns(folders, same_setup=same_setup))
+    page = render_comparison(compare_campaigns(folders, same_setup=same_setup), own=sheet_of_run(folders[-1]))
     return write_atomically(folders[0] / "comparison.html", lambda part: part.write_text(page, encoding="utf-8"))
 
 

@@ -18,6 +18,7 @@ from fusion.analysis.comparison import (
 from fusion.analysis.drift_model.recursion import events_of
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.common.messages import naming
+from fusion.pipeline.iso230 import sheet_of_run
 from fusion.report.comparison import (
     campaign_names,
     conclude_comparison,
@@ -127,7 +128,7 @@ def compare_runs(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     rows, titles = [], [one.results.campaign for one in (pair.before, pair.after)]
     write_json(out / "joint.json", {"campaigns": titles, **places_json(pairs, pair)})
     reports = [Path(os.path.relpath(folder, out), "report.html").as_posix() for folder in folders]
-    write_text(out / "joint.html", render_comparison(pairs, reports=reports))
+    write_text(out / "joint.html", render_comparison(pairs, reports=reports, own=sheet_of_run(folders[-1])))
     if pair.places is not None:
         write_dataset(out / "joint.nc", pair.places.maps)
         found = describe_places(pairs, pair)

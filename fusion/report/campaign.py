@@ -577,6 +577,7 @@ def describe_anomaly(anomaly: AnomalyPart) -> dict[str, Any]:
     evidence = anomaly.evidence
     return {
         "title": f"{upper_first(anomaly_place(anomaly))}: {anomaly_cause(anomaly)}",
+        "kind": evidence.kind,
         "sentence": say("anomaly_sentence", anomaly),
         "stands_out": say("stands_out", evidence),
         "support": evidence.support,

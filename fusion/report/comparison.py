@@ -19,8 +19,9 @@ from fusion.report.charts.comparison import (
 )
 from fusion.report.charts.style import embed
 from fusion.report.findings import findings
+from fusion.report.letterhead import PLAIN, Letterhead, translation
 from fusion.report.page import render_page
-from fusion.report.sheet import Sheet, Stated
+from fusion.report.sheet import Sheet, Stated, label
 from fusion.report.wording import (
     CHANNELS,
     ISO230_TERMS,
@@ -282,7 +283,7 @@ def places_json(pairs: Sequence[PairComparison], pair: PairComparison) -> dict[s
 # As found and as left: the sheet to sign.
 
 
-def describe_pair(pair: PairComparison) -> Sheet:
+def describe_pair(pair: PairComparison, own: Letterhead = PLAIN) -> Sheet:
     """Return the sheet of two tests: whose they were, what was adjusted, A, R, E, M, B of both, their change and decisions."""
     parts = [one.results.iso230 for one in (pair.before, pair.after)]
     conditions = [() if part is None else part.conditions for part in parts]
@@ -298,7 +299,7 @@ def describe_pair(pair: PairComparison) -> Sheet:
     done = remarks[1] if remarks[1] != remarks[0] else ""
     files = {f"results.json {which}": one.sha256 for which, one in (("as found", pair.before), ("as left", pair.after))}
     return Sheet(
-        title="As found, as left",
+        title=translation(own.language)("As found, as left"),
         standard="Accuracy and repeatability of positioning by ISO 230-2:2014, two tests of one axis",
         stated=Stated(
             [*identity, ("Done between the tests", done or "not stated")],
@@ -311,7 +312,8 @@ def describe_pair(pair: PairComparison) -> Sheet:
         requirements=table([], []),
         files=files,
         version=versions()["thermofuse"],
-    )
+        own=own,
+    ).in_its_language()
 
 
 def _values_as_left(pair: PairComparison) -> Table:
@@ -400,23 +402,26 @@ def _in_width(wide: Table, most: int) -> list[Table]:
     ]
 
 
-def render_comparison(pairs: Sequence[PairComparison], *, reports: Sequence[str] = ()) -> str:
+def render_comparison(pairs: Sequence[PairComparison], *, reports: Sequence[str] = (), own: Letterhead = PLAIN) -> str:
     """Return a comparison as a document: of two tests the sheet to sign, of more their trend; then what changed, then everything.
 
-    `reports` are the places of their reports, to which the page links.
+    `reports` are the places of their reports, to which the page links; `own` is what makes the sheet a laboratory's own.
     """
     tests, names = compared_tests(pairs), short_names(pairs)
+    sheet = describe_pair(pairs[0], own) if len(pairs) == 1 and pairs[0].before.record is None else None
     trends = follow_trends(pairs)
     charts = {
-        "profiles": plot_profiles(tests, names),
+        "profiles": plot_profiles(tests, [*map(sheet.tell, names)] if sheet else names),
         "scatters": plot_scatters(tests, names),
         **{f"remaining_{k}": plot_remaining(pair) for k, pair in enumerate(pairs, start=1)},
         **{f"trend_{trend.name}": draw_trend(trend) for trend in trends},
     }
+    if sheet is not None and (profiles := charts["profiles"]) is not None:
+        label(profiles, sheet.tell)
     return render_page(
         "comparison.html.j2",
         embed({name: chart for name, chart in charts.items() if chart is not None}),
-        sheet=describe_pair(pairs[0]) if len(pairs) == 1 and pairs[0].before.record is None else None,
+        sheet=sheet,
         names=campaign_names(pairs),
         compared=_shared([(conclude_comparison(pair), name) for name, pair in zip(names[1:], pairs, strict=True)]),
         table_said=conclude_table(pairs[0]),

@@ -190,12 +190,12 @@ def render_iso230(sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remark
     """Return the page of a test as HTML text: the sheet, then what it rests on."""
     summary = {"iso230": describe_iso230(part, dataset), "assumptions": {"iso230": ""}}
     charts = draw_iso230(dataset)
-    _label(charts["iso230"], sheet.tell)
+    label(charts["iso230"], sheet.tell)
     shown = {"sheet": sheet, "iso230": part, "remarks": remarks, "summary": summary}
     return render_page("iso230.html.j2", embed(charts), **shown)
 
 
-def _label(chart: Chart, tell: Translate) -> None:
+def label(chart: Chart, tell: Translate) -> None:
     """Name the axes of a chart in a language."""
     for axis in (chart.figure.below[0], chart.figure.left[0]):
         axis.axis_label = tell(axis.axis_label)
@@ -215,7 +215,7 @@ def render_thermal_tests(sheets: Sequence[Sheet], tests: Sequence[ThermalTest]) 
     summary = {"thermal_tests": describe_thermal_tests(tests), "assumptions": {"iso230-3": ""}}
     charts = draw_thermal_tests(tests)
     for chart in charts.values():
-        _label(chart, sheets[0].tell)
+        label(chart, sheets[0].tell)
     return render_page("iso230_3.html.j2", embed(charts), sheets=sheets, summary=summary)
 
 

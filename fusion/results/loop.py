@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
+from fusion.results.numbers import alike, measured, print_unit
 from fusion.results.parts import Number, PValue, Quantity, ResultPart, Sensitivity
 
 Verdict = Literal["complete", "explained", "partial", "unexplained", "no_skill"]
@@ -519,6 +520,20 @@ class Loop(HoldOutErrors):
         """The added effects that keep their name, where a cause can be separated."""
         return tuple(one for one in self.steps if self.separable and one.keeps_name)
 
+    def rows(self) -> list[tuple[str, str]]:
+        """Return names and texts of what was found, in short."""
+        errors = (self.errors.declared.rmse_um, self.errors.final.rmse_um)
+        return [
+            ("verdict", self.verdict.replace("_", " ")),
+            ("added effects", ", ".join(step.effect for step in self.steps) or "none"),
+            ("held-out error", f"{' -> '.join(alike(errors, distinct=False))} µm"),
+        ]
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {text}" for name, text in self.rows())
+
+    __repr__ = __str__
+
 
 class AxisLoop(Loop):
     """What the closed loop found along an axis."""
@@ -545,6 +560,11 @@ class AxisLoop(Loop):
     """Tests of the residual."""
     axis_line: AxisLine | None = None
     """Other lines, orders of the targets and signs; null where the expansion of the axis is not declared."""
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the coefficients with U (k = 2), then what was found."""
+        told = ((one.effect, measured(one.value, one.u, print_unit(one.unit))) for one in self.declared_coefficients)
+        return [*told, *super().rows()]
 
 
 class ChannelErrors(HoldOutErrors):

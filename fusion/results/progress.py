@@ -179,8 +179,8 @@ class Reporter(AbstractContextManager["Reporter"]):
         for label, (started, forecast_s, known) in list(self._running.items()):
             if forecast_s > 0.0 and now - started > max(_OVERDUE * forecast_s, _LEAST_OVERDUE_S):
                 self._console.print(
-                    f"{label}: {now - started:.0f} s so far, {known.format(forecast_s)}; Ctrl-C stops the run, finished stages are "
-                    "kept, and --resume goes on from them",
+                    f"{label}: {now - started:.0f} s so far, {known.format(forecast_s)}; Ctrl-C stops the run, and --resume "
+                    "goes on from its finished stages",
                     highlight=False,
                 )
                 self._running[label] = started, float("inf"), known

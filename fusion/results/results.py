@@ -29,7 +29,7 @@ from fusion.results.axis import (
     RegistrationPart,
 )
 from fusion.results.loop import AxisLoop, RecordLoop
-from fusion.results.numbers import alike, measured, p_words, print_unit
+from fusion.results.numbers import measured, p_words, print_unit
 from fusion.results.parts import (
     ContactSensorPart,
     FieldPart,
@@ -242,13 +242,7 @@ class Results(Parts, _Heading):
             )
             rows.append(("anomalies", "; ".join(named) or "none"))
         if self.loop is not None:
-            errors = self.loop.errors
-            before, after = alike([one.rmse_um for one in (errors.declared, errors.final)], distinct=False)
-            rows += [
-                ("verdict", self.loop.verdict.replace("_", " ")),
-                ("added effects", ", ".join(step.effect for step in self.loop.steps) or "none"),
-                ("held-out error", f"{before} -> {after} µm"),
-            ]
+            rows += self.loop.rows()
         return [*rows, ("warnings", str(len(self.warnings)))]
 
     def as_json(self) -> dict[str, Any]:

@@ -26,8 +26,10 @@ def results_screen(state: ui.State) -> pn.viewable.Viewable:
     field = ui.text_field("Results folder", state.results or state.root / "results")
     open_button = pn.widgets.Button(label="Open", color="primary", align="end")
     content = ui.column()
+    stands: list[int | None] = []
 
     def show(folder: Path | None) -> None:
+        stands[:] = [None if folder is None else _written(folder)]
         if folder is None:
             content[:] = [ui.note("No results are chosen: finish a run, or name the results folder of one.")]
             return
@@ -40,15 +42,22 @@ def results_screen(state: ui.State) -> pn.viewable.Viewable:
         except ui.PathError as error:
             content[:] = ui.faults(error)
             return
-        if folder == state.results:
-            show(folder)
-        else:
+        if folder != state.results:
             state.results = folder
+        elif stands != [_written(folder)]:
+            # What stands is not built anew: a click on it that is under way would be lost.
+            show(folder)
 
     open_button.on_click(open_typed)
     state.param.watch(lambda event: show(event.new), "results")
     show(state.results)
     return ui.column(ui.heading("Results"), pn.Row(field, open_button, sizing_mode="stretch_width"), content)
+
+
+def _written(folder: Path) -> int | None:
+    """Return when the results of a folder were written, in ns of the system's clock; None where there are none."""
+    found = folder / "results.json"
+    return found.stat().st_mtime_ns if found.is_file() else None
 
 
 def _parts(state: ui.State, products: Products) -> ui.Parts:

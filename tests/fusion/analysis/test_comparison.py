@@ -88,7 +88,7 @@ def test_models_with_other_effects_are_not_compared(before: Path, tmp_path: Path
     other = write_results(tmp_path / "after", readings_of(32), loop=loop_with(steps=[]))
     (pair,) = compare_campaigns([before, other])
     assert not [change for change in pair.changes if change.group == "drift per kelvin"]
-    assert pair.not_compared[0] == Lack("effects", ("step event", "nothing more"))
+    assert pair.not_compared[0] == Lack("effects", ("step event", "nothing of its own"))
 
 
 def test_other_targets_leave_the_standard_out(before: Path, tmp_path: Path) -> None:

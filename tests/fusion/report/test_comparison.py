@@ -26,6 +26,7 @@ from fusion.report.comparison import (
     side_by_side,
     trend_caption,
 )
+from fusion.report.letterhead import Letterhead
 from fusion.results.parts import Quantity
 from tests.fusion.compared_tests import readings_of, repaired, write_results
 from tests.fusion.results_sample import PARTS
@@ -167,6 +168,10 @@ def test_the_sheet_states_whose_axis_it_was_what_was_done_and_the_decisions(tmp_
         [left, write_results(tmp_path / "again", readings, iso230=part("3 March", 1.0, "pass", remarks="gib adjusted"))]
     )
     assert dict(describe_pair(back).stated.identity)["Done between the tests"] == "not stated"
+    german = describe_pair(back, Letterhead(language="de"))
+    assert german.title == "Eingangszustand und Ausgangszustand" and german.values.titles[3] == "Änderung / µm"
+    assert dict(german.stated.identity)["Zwischen den Prüfungen ausgeführt"] == "nicht angegeben"
+    assert dict(german.stated.identity)["Date, Ausgangszustand"] == "3 March"
     assert sheet.stated.signatures[0] == ("Measured by", "R. Meyer")
     row = sheet.values.rows[0]
     assert row.marked
@@ -284,7 +289,7 @@ def test_a_neighbouring_place_is_told_apart_and_reconciled(pairs):
     assert first[-1].startswith(f"shown by the test {FOUND} only; ") and "a different one: 3.8 and 7.8" in first[-1]
     assert "75 mm both agree (place 2)" in first[-1]
     assert second[-1].startswith("both tests agree here, but it is not a separate source")
-    assert found["said"][0] == "The drift follows no place in both tests."
+    assert found["said"][0] == "No place is a heat source of its own in both tests."
     assert found["said"][1].startswith("Both agree in place 2 (x 330 mm, y 90 mm")
     assert found["said"][2] == f"Only the test {FOUND} shows place 1." and found["repeated"] == []
 
@@ -313,4 +318,4 @@ def test_the_page_escapes_titles_and_links_both_reports(pairs):
     page = render_comparison([pair], reports=["monday/report.html", "tuesday/report.html"])
     assert "Monday &lt;1&gt;" in page and "<1>" not in page
     assert 'href="monday/report.html"' in page and 'href="tuesday/report.html"' in page
-    assert "The drift follows no place in both tests." in page
+    assert "No place is a heat source of its own in both tests." in page

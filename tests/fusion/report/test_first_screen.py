@@ -18,7 +18,7 @@ from tests.fusion.report.test_record import record
 from tests.fusion.results_sample import RECORD_LOOP
 
 #: Words that are read in half a minute.
-MOST = 187
+MOST = 165
 
 
 @pytest.fixture(scope="module")

@@ -461,10 +461,7 @@ def test_what_an_effect_follows_is_told_with_its_time_constant():
 def test_effects_that_are_not_separated_are_told_as_one_of_these():
     tied = axis_step("unseen_heat_source", tied=("thermal_lag",), parameters={"follows": "duty"})
     told = say("verdict", loop("explained", tied), None, False)
-    assert (
-        "lacks one of these, which these data do not separate: an unseen heat source (follows"
-        in told
-    )
+    assert "lacks one of these, which these data do not separate: an unseen heat source (follows" in told
     assert "or a part of the machine that follows the measured temperatures with a lag" in told
     asked = action(tied, None, record=False)
     assert effect_words("thermal_lag").remedy in asked and effect_words("unseen_heat_source").remedy in asked
