@@ -222,9 +222,14 @@ def _hotspot(rise: xr.DataArray, stack: Array, source: Sequence[_Peak], last: in
     rows, columns = np.nonzero(zone)
     whole = scipy.ndimage.binary_fill_holes(seen)
     outside = ~scipy.ndimage.binary_erosion(np.pad(whole, 1), np.ones((3, 3)))[1:-1, 1:-1]
-    column, row, height, u = _vertex(values, peak)
+    column, row, height, u, radius = _vertex(values, peak)
+    # On a plateau, where no shape is known of all that noise does not tell from the peak, the peak may lie anywhere.
+    alike = zone & (field >= peak.rise_K - _EQUAL_RISE * peak.noise_K / 2)
+    spread = np.std(np.nonzero(alike), axis=1)[::-1]
+    if np.sqrt(3.0) * spread.max() > radius:
+        u[:2] = np.hypot(u[:2], spread)
     # Where noise does not tell the edge of the seen plan from the peak, the peak may lie there.
-    rim = np.argwhere(zone & outside & (field >= peak.rise_K - _EQUAL_RISE * peak.noise_K / 2))
+    rim = np.argwhere(alike & outside)
     if len(rim):
         u[:2] = np.hypot(u[:2], np.abs(rim - (row, column)).max(axis=0)[::-1] / np.sqrt(3.0))
     at = (min(max(round(row), 0), len(y) - 1), min(max(round(column), 0), len(x) - 1))
@@ -284,10 +289,12 @@ def _prominences(field: Array, order: NDArray[np.int64]) -> Array:
     return prominence.reshape(rows, columns)
 
 
-def _vertex(values: Array, peak: _Peak) -> tuple[float, float, float, Array]:
-    """Column, row and rise of the top of the shape around a peak, and their standard uncertainties, cells and K."""
+def _vertex(values: Array, peak: _Peak) -> tuple[float, float, float, Array, float]:
+    """Column, row and rise of the top of the shape around a peak, their standard uncertainties, cells and K, and the radius of the largest
+    disc that shows that shape; infinite where none does, as the uncertainty is that of all cells then.
+    """
     row, column = peak.place
-    tops, us, beyond, models, misfits = [], [], [], [], np.zeros((2, 3))
+    tops, us, beyond, models, radii, misfits = [], [], [], [], [], np.zeros((2, 3))
     least, most = np.array([-column, -row]) - 0.5, np.array([values.shape[1] - column, values.shape[0] - row]) - 0.5
     for sloping in (False, True):
         smaller = None
@@ -309,13 +316,14 @@ def _vertex(values: Array, peak: _Peak) -> tuple[float, float, float, Array]:
                 tops.append(top)
                 us.append(u)
                 models.append(int(sloping))
+                radii.append(radius)
                 smaller = radius
     if not tops:
         # No shape: the cells that the noise does not tell from the warmest.
         rows, columns = np.nonzero(peak.zone)
         u = np.maximum([columns.std(), rows.std()], np.sqrt(_OF_CELL))
         height_u = np.hypot(peak.noise_K, peak.prominence_K / 4)
-        return float(column), float(row), peak.rise_K, np.array([*u, height_u])
+        return float(column), float(row), peak.rise_K, np.array([*u, height_u]), np.inf
     top, each_u = np.array(tops), np.array(us)
     best = int(np.argmin(each_u.prod(axis=1)))
     weight = 1.0 / each_u**2
@@ -328,7 +336,7 @@ def _vertex(values: Array, peak: _Peak) -> tuple[float, float, float, Array]:
     for at in beyond:  # the place is known to the edge
         beside[:2] = np.maximum(beside[:2], (at - top[best, :2]) ** 2)
     x, y, height = top[best].tolist()
-    return column + x, row + y, height, np.sqrt(each_u[best] ** 2 + scatter + beside)
+    return column + x, row + y, height, np.sqrt(each_u[best] ** 2 + scatter + beside), float(max(radii))
 
 
 def _fit_shape(values: Array, peak: _Peak, radius: int, sloping: bool) -> tuple[Array, Array, float] | None:
