@@ -360,7 +360,8 @@ def camera_picture(fields: xr.Dataset) -> Found | None:
 @check("fields", CAMERA)
 def camera_zero(fields: xr.Dataset) -> Found | None:
     """Change that all discs share with the table around them, after the correction of the camera, with the room and apart from it: more
-    than `_PICTURE_K` K of both is not verified, and doubted where the uncertainty of the zero may be more than `_ZERO_SHARE` of the mean rise.
+    than `_PICTURE_K` K of both is not verified, and doubted where the uncertainty of the zero may be more than `_ZERO_SHARE` of the mean
+    rise.
     """
     shown = json.loads(fields.attrs.get("discs", "{}"))
     if not shown or "untested" in shown:
