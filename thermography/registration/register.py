@@ -209,8 +209,8 @@ _LARGEST_PICK_SCATTER_PX = 3.0
 _LARGEST_AREA_RATIO = 1.3
 #: Share of the discs that must show about the same ratio of areas for it to be a fault of the list.
 _ALIKE = 0.75
-#: Diameter that a point has as a spot, at half its height, px: what a focused lens and the smoothing before the search make of it.
-_SPOT_BLUR_PX = 2.5
+#: Area of a point above half its height, px, by which every spot is larger: a focused lens and the smoothing before the search blur it.
+_SPOT_PX = 4.9
 #: Distance within which a spot belongs to a hint in `size_contradiction`, px.
 _EVIDENCE_REACH_PX = 30.0
 
@@ -333,7 +333,7 @@ def size_contradiction(spots: Sequence[LocatedDisc], fiducials: Sequence[Fiducia
         near = [(_from_hint(disc, spot), spot.area_px) for spot in spots]
         distance, area = min(near, default=(inf, 0.0))
         if distance < _EVIDENCE_REACH_PX:
-            ratios.append(area / _spot_area(disc, scale))
+            ratios.append((area - _SPOT_PX) / (np.pi / 4 * disc.diameter_mm**2 * scale))
     if len(ratios) < 4:
         return ""
     off = np.log(ratios) - np.log(np.median(ratios))
@@ -341,11 +341,6 @@ def size_contradiction(spots: Sequence[LocatedDisc], fiducials: Sequence[Fiducia
     if not alike or abs(np.log(np.median(ratios))) < np.log(_LARGEST_AREA_RATIO):
         return ""
     return _size_message(float(np.sqrt(np.median(ratios))), hinted)
-
-
-def _spot_area(disc: Fiducial, magnification: float) -> float:
-    """Area, px, of the spot that a disc makes where the plan is seen at so many px2 per mm2."""
-    return float(np.pi / 4 * (disc.diameter_mm**2 * magnification + _SPOT_BLUR_PX**2))
 
 
 def _size_message(factor: float, fiducials: Sequence[Fiducial]) -> str:
@@ -534,7 +529,7 @@ def _nearest(
     magnification = np.abs(aside[:, 0] * below[:, 1] - aside[:, 1] * below[:, 0])
     pairs = []
     for i, disc in enumerate(fiducials):
-        expected = _spot_area(disc, magnification[i])
+        expected = np.pi / 4 * disc.diameter_mm**2 * magnification[i] + _SPOT_PX
         for j, spot in enumerate(spots):
             distance = np.hypot(spot.column_px - places[i, 0], spot.row_px - places[i, 1])
             if distance < tolerance_px and expected / 2 < spot.area_px < 2 * expected:
