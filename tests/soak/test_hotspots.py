@@ -85,9 +85,9 @@ KINDS = {
     **{f"gaussian {width}": (0.55, 1.6) for width in (6, 10, 30, 60)},
     "elliptic": (0.45, 1.6),
     "on a slope": (0.3, 1.6),
-    **dict.fromkeys(("two, 50 mm apart", "rectangle", "at the edge"), (0.0, 1.6)),
-    # The cusp of an exponential is narrower than a cell; noise on a disc that is flat is taken for a narrow peak in none to two of 60.
-    **dict.fromkeys(("exponential", "flat disc"), (0.0, 2.0)),
+    **dict.fromkeys(("two, 50 mm apart", "at the edge"), (0.0, 1.6)),
+    # The cusp of an exponential is narrower than a cell; noise on a plateau is taken for a narrow peak in none to two of 60.
+    **dict.fromkeys(("exponential", "flat disc", "rectangle"), (0.0, 2.0)),
 }
 
 
