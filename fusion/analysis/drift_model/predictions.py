@@ -169,10 +169,10 @@ def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
 
 
 def parts_left_out(record: Record, used: NDArray[np.bool_]) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Every part of a record, or every run of several, behind all others that are used, earlier and later ones."""
+    """Every part of a record, or every run of several, behind all others that are used, earlier and later ones; none where it is alone."""
     numbers = record.run if np.unique(record.run[used]).size > 1 else record.chained
     parts = [numbers == number for number in np.unique(numbers[used])]
-    return [(used & ~part, part) for part in parts]
+    return [(used & ~part, part) for part in parts if (used & ~part).any()]
 
 
 def predict_parts(
