@@ -49,7 +49,7 @@ SAMPLES: dict[str, tuple[Results, dict[str, Any]]] = {
 #: What each of them says, in its order; doubled are those of several steps, values and regions.
 CODES = {
     "axis": (
-        "quoted A R E M B drift mean_rise scatter verdict how_much where how_sure what_remains declared added held_out plain_predictions "
+        "quoted A R E M B drift scatter verdict how_much where how_sure what_remains declared added held_out plain_predictions "
         "noise_floor next warning"
     ),
     "laser": "quoted quoted quoted quoted A R E M B how_much next",
