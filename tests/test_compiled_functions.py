@@ -37,7 +37,7 @@ def test_without_a_folder_that_can_be_written_functions_are_compiled_in_memory_w
     environment = {name: value for name, value in os.environ.items() if name != "THERMOFUSE_COMPILES_IN_MEMORY"}
     environment |= {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
     environment |= {"NUMBA_CACHE_DIR": str(tmp_path) if named else ""}
-    code = f"import numpy as np, {', '.join(modules)}\nprint(thermography.io.png16._paeth(np.int64(3), np.int64(7), np.int64(4)))"
+    code = f"import numpy as np, {', '.join(modules)}\nprint(thermography.io.fff_record._paeth(np.int64(3), np.int64(7), np.int64(4)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
     assert done.stdout == "7\n", "of 3, 7 and 4 the one nearest to 3 + 7 - 4 = 6"
     notices = done.stderr.splitlines()

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusion.analysis.consistency.library import RULES
+from fusion.analysis.consistency import RULES
 from fusion.campaign.remote import read_registry
 from tests.readme import measured_files
 

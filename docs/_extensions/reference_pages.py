@@ -19,7 +19,7 @@ from sphinx.application import Sphinx
 
 import thermofuse
 from fusion import cli
-from fusion.analysis.consistency.library import RULES
+from fusion.analysis.consistency import RULES
 from fusion.campaign.config import campaign_schema
 from fusion.campaign.inspect import Kind
 from fusion.report.wording import environment

@@ -32,7 +32,7 @@ from fusion.results.loop import AxisLoop, Coefficient
 from fusion.results.parts import Quantity, TablePrediction
 from fusion.results.results import Results
 from interferometry.drift.estimate import COMPONENTS
-from interferometry.iso230.budget import LENGTHS
+from interferometry.iso230.quantities import LENGTHS
 from thermography.common import scatter_by_median
 
 # What changed in the profile of an axis between two tests, whatever thermal state each of them was in.

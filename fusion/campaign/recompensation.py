@@ -15,7 +15,7 @@ from fusion.results.results import Notice
 from interferometry.compensation import SensorUncertainty, air_index, compensate, dead_path_error_um, followed_factor_um
 from interferometry.io.readings import AIR_AND_MATERIAL
 from interferometry.iso230 import Iso230Budget
-from interferometry.iso230.budget import LENGTHS, SCATTER_ALONE
+from interferometry.iso230.quantities import LENGTHS, SCATTER_ALONE
 
 # The uncertainty budget of a campaign's ISO 230-2 values: what is stated, what was measured, what is assumed.
 

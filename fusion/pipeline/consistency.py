@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.analysis.alignment.readings import ReadingsError, read_fused
+from fusion.analysis.consistency import RULES
 from fusion.analysis.consistency.camera import compare_phase, file_warnings
 from fusion.analysis.consistency.checks import Found, Inputs, Phase, Rule
-from fusion.analysis.consistency.clocks import Evidence, Recording, compare_clocks
+from fusion.analysis.consistency.clocks import Evidence, Motion, Recording, compare_clocks
 from fusion.analysis.consistency.courses import compare_drift, compare_load, compare_material
 from fusion.analysis.consistency.field_series import field_at, log_with_camera, thin_fields
-from fusion.analysis.consistency.library import RULES
-from fusion.analysis.consistency.motion import Motion
 from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import CameraInputs, LaserInputs, Source, is_rotary, overridden_parameters
 from fusion.campaign.inputs import Inputs as Read

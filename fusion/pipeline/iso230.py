@@ -50,8 +50,8 @@ from interferometry.iso230 import (
     evaluate_other_standards,
     evaluate_windows,
 )
-from interferometry.iso230.budget import LENGTHS
 from interferometry.iso230.conditions import check_conditions
+from interferometry.iso230.quantities import LENGTHS
 
 _LAST = f"the last {STANDARD_CYCLES} whole cycles of the test"
 _ONLY = "the only window of the test"

@@ -12,10 +12,9 @@ import xarray as xr
 
 from fusion.analysis.alignment.sensor_health import describe_fault
 from fusion.analysis.attribution.duty import DutyPlanError, Machine, plan_duty, switchings
-from fusion.analysis.drift_model.next_test import NextTest, choose_test, propose_tests
 from fusion.analysis.drift_model.record import examine_record
 from fusion.analysis.drift_model.record_data import reduce_record
-from fusion.analysis.drift_model.verification import ChannelVerdict, verify
+from fusion.analysis.drift_model.verification import ChannelVerdict, NextTest, choose_test, propose_tests, verify
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.schema import keys_of

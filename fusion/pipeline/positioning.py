@@ -9,7 +9,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, add_sensor_line, align, align_logs
 from fusion.analysis.consistency.camera import find_gaps, gap_words, in_gaps
-from fusion.analysis.consistency.readings import find_gross_readings
+from fusion.analysis.consistency.deviations import find_gross_readings
 from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose, diagnose_link
 from fusion.analysis.levels import POSITION_LEVEL
 from fusion.campaign.inputs import LaserInputs, Source, lacks_course

@@ -17,7 +17,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fusion.analysis.effects.plugins import GROUP, describe_code, plugins
+from fusion.analysis.effects.library import GROUP, describe_code, plugins
 from fusion.campaign.config import Campaign
 from fusion.common import place_within, versions
 from fusion.pipeline.workers import Worker

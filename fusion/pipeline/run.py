@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from fusion.analysis.alignment.align import describe_sensors, join_sensors
 from fusion.analysis.consistency.clocks import FOLLOWING_NOTICES
-from fusion.analysis.effects.plugins import plugins
+from fusion.analysis.effects.library import plugins
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import (
     CameraInputs,

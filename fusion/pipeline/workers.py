@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer")
 #: What the second process loads while the first reads the campaign, where it is not a copy of a process that has it.
-_LIBRARIES = ("fusion.pipeline.run", "interferometry.iso230.uncertainty", "fusion.report.charts.campaign")
+_LIBRARIES = ("fusion.pipeline.run", "interferometry.iso230.quantities", "fusion.report.charts.campaign")
 #: No file of the working folder is imported as a module; and a process that is killed leaves no warning of its semaphores.
 _ENVIRONMENT = {"PYTHONSAFEPATH": "1", "PYTHONWARNINGS": "ignore::UserWarning:multiprocessing.resource_tracker"}
 #: In the second process: where it sends its progress.

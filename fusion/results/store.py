@@ -24,7 +24,7 @@ from fusion.common import FusionError, own_name, place_within
 from interferometry.common import DEVIATIONS, DIRECTIONS
 from thermography.common import FIELDS
 from thermography.io import files as atomic
-from thermography.io.hdf5 import hdf5_fault
+from thermography.io.files import hdf5_fault
 from thermography.large_arrays import IN_MEMORY_BYTES, in_pieces
 
 if TYPE_CHECKING:

@@ -1,12 +1,11 @@
 """ISO 230-2: accuracy and repeatability of positioning, over any window of cycles, with the uncertainty budget of each quantity.
 
-Evaluation (:mod:`interferometry.iso230.evaluation`), the inputs of the budget (:mod:`interferometry.iso230.budget`) and the uncertainty
-(:mod:`interferometry.iso230.uncertainty`)::
+Evaluation (:mod:`interferometry.iso230.evaluation`), and the quantities with their uncertainty and the inputs of its budget
+(:mod:`interferometry.iso230.quantities`)::
 
     result = evaluate_iso230(deviations, cycles=[1, 2, 3, 4, 5], budget=Iso230Budget(device_ppm=0.1))
 """
 
-from interferometry.iso230.budget import CONTRIBUTIONS, SAMPLING, Iso230Budget
 from interferometry.iso230.evaluation import (
     STANDARD_CYCLES,
     accuracy_with_table,
@@ -14,7 +13,7 @@ from interferometry.iso230.evaluation import (
     evaluate_other_standards,
     evaluate_windows,
 )
-from interferometry.iso230.quantities import QUANTITIES
+from interferometry.iso230.quantities import CONTRIBUTIONS, QUANTITIES, SAMPLING, Iso230Budget
 
 __all__ = [
     "CONTRIBUTIONS",

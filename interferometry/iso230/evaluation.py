@@ -24,9 +24,16 @@ import xarray as xr
 from interferometry.common import InterferometryError, check_dataset
 from interferometry.compensation import REFERENCE_TEMPERATURE_DEGC
 from interferometry.deviations import DIRECTIONS
-from interferometry.iso230.budget import CONTRIBUTIONS, SCATTER_ALONE, Iso230Budget
-from interferometry.iso230.quantities import AXIS, ONE_WAY, axis_quantities, target_quantities
-from interferometry.iso230.uncertainty import uncertainties
+from interferometry.iso230.quantities import (
+    AXIS,
+    CONTRIBUTIONS,
+    ONE_WAY,
+    SCATTER_ALONE,
+    Iso230Budget,
+    axis_quantities,
+    target_quantities,
+    uncertainties,
+)
 
 STANDARD_CYCLES = 5
 #: Windows of a long test that are evaluated before their results become one.

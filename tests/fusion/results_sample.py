@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fusion.analysis.consistency.library import RULES
+from fusion.analysis.consistency import RULES
 from fusion.pipeline.consistency import Check
 from fusion.report.wording import environment
 

@@ -11,7 +11,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from fusion.analysis.alignment.reflections import find_switching_patch
+from fusion.analysis.alignment.align import find_switching_patch
 from fusion.analysis.attribution.correlate import correlate
 from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.analysis.drift_model.evaluation import LoopResult

@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.analysis.drift_model.next_test import choose_test, propose_tests
 from fusion.analysis.drift_model.record import hold_out
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, reduce_record
 from fusion.analysis.drift_model.recursion import columns_of, evaluate_columns, follow, make_recursion
-from fusion.analysis.drift_model.verification import ChannelVerdict, verify
+from fusion.analysis.drift_model.verification import ChannelVerdict, choose_test, propose_tests, verify
 from fusion.results.recursion import Recursion, run_recursion
 from tests.fusion.record_tables import table_of
 from tests.soak.rates import campaigns, first_seed

@@ -15,7 +15,6 @@ from thermography.common import Array, ThermographyError
 from thermography.fields.cycle_fields import PARTLY_SEEN_BELOW, SURFACE_EDGE, annotate, rate, reference_cycle
 from thermography.io.frame import CameraParameters
 from thermography.large_arrays import empty_array, give_back, in_pieces
-from thermography.radiometry.emissivity import EmissivityEstimate, KnownState, estimate_emissivity
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     count_line,
@@ -26,8 +25,11 @@ from thermography.radiometry.planck import (
 )
 from thermography.radiometry.uncertainty import (
     FIRST_ORDER_TOLERANCE,
+    EmissivityEstimate,
     InputUncertainty,
+    KnownState,
     common_contributions,
+    estimate_emissivity,
     monte_carlo_ratio,
     reading_sensitivity,
     reflected_sensitivity,

@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
 from thermofuse.resources import vocabulary
 from thermography.common import ZERO_CELSIUS_K, ThermographyError
+from thermography.io.files import MOST_OBJECTS, hdf5_fault
 from thermography.io.flir import FlirReader, index_files
 from thermography.io.frame import CalibratedRange, CameraParameters, FrameReference, RejectedFrame
-from thermography.io.hdf5 import MOST_OBJECTS, hdf5_fault
 from thermography.io.sequence import FrameList, FrameTable
 
 #: Planck's constant B of a camera for 7.5 to 13 um, K.

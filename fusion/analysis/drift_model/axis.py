@@ -19,9 +19,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.analysis.alignment.align import cycle_bounds
+from fusion.analysis.alignment.align import cycle_bounds, find_switching_patch
 from fusion.analysis.alignment.readings import Readings
-from fusion.analysis.alignment.reflections import find_switching_patch
 from fusion.analysis.diagnosis import residual as remainder
 from fusion.analysis.diagnosis.residual import Remainder
 from fusion.analysis.drift_model.admissibility import (

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from fusion.analysis.alignment.align import AlignmentError
-from fusion.analysis.consistency.library import RULES
+from fusion.analysis.consistency import RULES
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import read_source
 from fusion.pipeline.check import check_campaign

@@ -17,7 +17,7 @@ from interferometry.iso230 import (
     evaluate_other_standards,
     evaluate_windows,
 )
-from interferometry.iso230.budget import SCATTER_ALONE
+from interferometry.iso230.quantities import SCATTER_ALONE
 from tests.interferometry.iso230.made_tests import by_hand, test_made
 from tests.interferometry.simulated_campaigns import simulate
 

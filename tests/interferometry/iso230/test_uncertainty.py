@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from interferometry.iso230 import CONTRIBUTIONS, Iso230Budget, evaluate_iso230
-from interferometry.iso230.budget import SCATTER_ALONE
-from interferometry.iso230.quantities import ONE_WAY, QUANTITIES, axis_quantities, target_quantities
+from interferometry.iso230.quantities import ONE_WAY, QUANTITIES, SCATTER_ALONE, axis_quantities, target_quantities
 from tests.interferometry.iso230.made_tests import test_made
 
 pytestmark = pytest.mark.long

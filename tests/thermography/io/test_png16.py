@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermography.io.fff_record import SIGNATURES
-from thermography.io.png16 import PngError, decode_png
+from thermography.io.fff_record import SIGNATURES, PngError, decode_png
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

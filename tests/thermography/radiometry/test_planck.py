@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from tests.thermography.flir_mutations import PARAMETERS, TIME, frame
 from thermography.io.flir import read_frame
-from thermography.radiometry.emissivity import KnownState, estimate_emissivity
 from thermography.radiometry.planck import (
     Overrides,
     ParameterLog,
@@ -26,6 +25,7 @@ from thermography.radiometry.planck import (
     temperature_from_counts,
     transmission,
 )
+from thermography.radiometry.uncertainty import KnownState, estimate_emissivity
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from fusion.analysis.alignment.reflections import find_switching_patch
+from fusion.analysis.alignment.align import find_switching_patch
 
 pytestmark = pytest.mark.long
 
@@ -43,7 +43,7 @@ def test_a_switching_patch_is_found_with_its_size(lit):
 
 def test_a_patch_of_a_long_test_is_found_among_the_largest_changes(lit, monkeypatch):
     known = find_switching_patch(lit)
-    monkeypatch.setattr("fusion.analysis.alignment.reflections._MOST_CHANGES", 15)
+    monkeypatch.setattr("fusion.analysis.alignment.align._MOST_CHANGES", 15)
     monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 7 * 8 * 12 * 20)
     patch = find_switching_patch(lit)
     # The noise of 0.03 K is 2 % of the jump; the component of the fifteen largest changes differs by a part of that.
@@ -99,7 +99,7 @@ def test_the_course_of_a_patch_without_noise_is_exact():
 
 def test_frames_of_a_long_test_are_never_held_in_double_precision(monkeypatch):
     monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 64 * 8 * 10 * 20)
-    monkeypatch.setattr("fusion.analysis.alignment.reflections._MOST_CHANGES", 250)
+    monkeypatch.setattr("fusion.analysis.alignment.align._MOST_CHANGES", 250)
     frames = np.random.default_rng(4).standard_normal((1500, 10, 20)).astype(np.float32)
     # What is imported at the first call is none of the frames.
     find_switching_patch(frames[:40])

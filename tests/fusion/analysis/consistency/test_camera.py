@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.analysis.consistency import RULES
 from fusion.analysis.consistency.camera import (
     file_warnings,
     find_gaps,
@@ -20,8 +21,7 @@ from fusion.analysis.consistency.camera import (
     zero_share,
 )
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.consistency.library import RULES
-from fusion.analysis.consistency.motion import Motion
+from fusion.analysis.consistency.clocks import Motion
 from fusion.pipeline.consistency import Check, _worded, run_checks
 from fusion.results.axis import RegistrationPart
 from tests.fusion.analysis.consistency.twin_fields import recorded

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import xarray as xr
 
+from fusion.analysis.consistency import RULES
 from fusion.analysis.consistency.checks import LASER, Found, Inputs, check, judge
-from fusion.analysis.consistency.library import RULES
 from fusion.pipeline.consistency import (
     ContradictionError,
     doubt_notices,
@@ -15,7 +15,7 @@ from fusion.pipeline.consistency import (
     refuse_contradictions,
     run_checks,
 )
-from tests.fusion.analysis.consistency.test_readings import sound as sound_readings
+from tests.fusion.analysis.consistency.test_deviations import sound as sound_readings
 from tests.fusion.results_sample import told
 
 SOUND, DOUBT = told("travel", passed=True), told("copied_cycles", passed=False)

@@ -9,7 +9,6 @@ import xarray as xr
 
 from fusion.analysis.alignment.readings import Series
 from fusion.analysis.attribution.duty import DutyPlanError
-from fusion.analysis.drift_model.next_test import choose_test, covariance_after, propose_tests
 from fusion.analysis.drift_model.record import close_record
 from fusion.analysis.drift_model.record_data import Record, reduce_record
 from fusion.analysis.drift_model.recursion import (
@@ -26,6 +25,7 @@ from fusion.analysis.drift_model.recursion import (
     respond,
     sensor_curve,
 )
+from fusion.analysis.drift_model.verification import choose_test, covariance_after, propose_tests
 from fusion.pipeline.record import record_variables
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import FAILED, OK, SATURATED, Recursion, RecursionError, run_recursion

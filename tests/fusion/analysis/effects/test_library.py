@@ -12,10 +12,16 @@ import pytest
 
 from fusion.analysis.alignment.readings import Readings, Series
 from fusion.analysis.effects import library as library_module
-from fusion.analysis.effects import plugins as module
 from fusion.analysis.effects.effect import Effect
-from fusion.analysis.effects.library import LIBRARY, describe_effect, library
-from fusion.analysis.effects.plugins import PluginError, describe_code, load_plugin, plugins
+from fusion.analysis.effects.library import (
+    LIBRARY,
+    PluginError,
+    describe_code,
+    describe_effect,
+    library,
+    load_plugin,
+    plugins,
+)
 from fusion.analysis.effects.thermal import quasi_static
 from fusion.common import NO_PLUGINS
 from fusion.results.parts import PluginPart
@@ -131,16 +137,18 @@ def test_an_effect_of_another_distribution_is_listed_with_its_version_and_used(i
 
 def test_the_code_of_a_plug_in_is_found_without_importing_it(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "machine_effects", raising=False)
-    (described,) = describe_code(module.GROUP)
+    (described,) = describe_code(library_module.GROUP)
     assert described["version"] == "1.4" and described["code"] == [installed / "machine_effects.py"]
     assert "machine_effects" not in sys.modules
     package = installed / "bed_effects"
     (package / "__pycache__").mkdir(parents=True)
     for name in ("__init__.py", "shapes.csv", "__pycache__/shapes.pyc"):
         (package / name).write_text("raise RuntimeError\n")
-    points = [EntryPoint("bed", origin, module.GROUP) for origin in ("bed_effects.plates:bed", "absent_module:bed")]
-    monkeypatch.setattr(module, "entry_points", lambda group: points)
-    of_package, of_none = describe_code(module.GROUP)
+    points = [
+        EntryPoint("bed", origin, library_module.GROUP) for origin in ("bed_effects.plates:bed", "absent_module:bed")
+    ]
+    monkeypatch.setattr(library_module, "entry_points", lambda group: points)
+    of_package, of_none = describe_code(library_module.GROUP)
     assert of_package["code"] == [package / "__init__.py", package / "shapes.csv"]
     assert of_none["code"] == [] and of_none["distribution"] == "unknown"
 
@@ -162,7 +170,7 @@ def test_plugins_are_left_out_where_the_environment_says_so(installed: Path, mon
 def test_an_effect_that_cannot_be_used_is_named_with_its_distribution(installed: Path, origin: str, why: str) -> None:
     plugin = PluginPart(name="bed_bending", origin=origin, distribution="machine-effects", version="1.4")
     with pytest.raises(PluginError) as error:
-        load_plugin(plugin, EntryPoint("bed_bending", origin, module.GROUP))
+        load_plugin(plugin, EntryPoint("bed_bending", origin, library_module.GROUP))
     assert str(error.value) == (
         f"the effect bed_bending ({origin}) of machine-effects 1.4 {why}; "
         "correct or uninstall that distribution, or add --no-plugins"

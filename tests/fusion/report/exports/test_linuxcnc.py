@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.analysis.drift_model.next_test import NextTest
+from fusion.analysis.drift_model.verification import NextTest
 from fusion.pipeline.plan import write_nc_program
 from fusion.report.exports.controls import ErrorTable, emit, linuxcnc
 from fusion.results.recursion import Kept, first_order_weights, run_recursion

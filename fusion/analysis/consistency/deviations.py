@@ -1,4 +1,4 @@
-"""Checks of the readings alone: magnitude and unit, travel, copies, clipping, missed triggers, exchanged directions of approach."""
+"""Checks of the deviations alone: magnitude and unit, travel, copies, clipping, missed triggers, exchanged directions of approach."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.consistency.readings import (
+from fusion.analysis.consistency.deviations import (
     _equal_shares,
     find_gross_readings,
     random_part_um,
@@ -254,7 +254,7 @@ def test_shares_of_equal_readings_are_those_of_every_pair_of_cycles(
     values = np.round(rng.normal(size=(30, 6)), 1)
     values[rng.random(values.shape) < 0.2] = np.nan
     values[4] = np.nan
-    monkeypatch.setattr("fusion.analysis.consistency.readings._CYCLES_AT_ONCE", 7)
+    monkeypatch.setattr("fusion.analysis.consistency.deviations._CYCLES_AT_ONCE", 7)
     told = np.vstack([shares for _, shares in _equal_shares(values)])
     both = (np.isfinite(values)[:, None] & np.isfinite(values)).sum(axis=2)
     expected = (values[:, None] == values).sum(axis=2) / np.maximum(both, 1)
