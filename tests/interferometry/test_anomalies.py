@@ -14,6 +14,7 @@ from interferometry.anomalies import (
     generalised_esd,
 )
 from interferometry.common import InterferometryError
+from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift
 from interferometry.drift.gls import Autoregression
 from tests.interferometry.simulated_campaigns import SIGMA_UM, recorded, simulate
@@ -369,3 +370,15 @@ def test_a_jump_that_carries_everything_beyond_is_a_link_and_no_scatter_of_a_pos
     assert one.direction == ("both" if len(sides) == 2 else "positive")
     # Standard uncertainty of a standard deviation from successive differences of 100 values: sqrt(3 / 400), 9 %; three of them.
     assert one.extra_um == pytest.approx(0.8, rel=0.3)
+
+
+def test_jumps_that_pass_for_a_bend_of_the_drift_are_a_link():
+    rng = np.random.default_rng(5)
+    made = 0.3 * rng.standard_normal((30, 2, 10))
+    jumps = rng.standard_normal(31)
+    # Neighbours are alike, which is how the drift is told from noise.
+    made[:, :, 4:] += (jumps[1:] + 0.6 * jumps[:-1])[:, None, None]
+    time = np.datetime64("2026-03-09T06:30") + 8 * np.arange(made.size).reshape(made.shape) * np.timedelta64(1, "s")
+    test = build_deviations(range(1, 31), range(1, 11), 20.0 * np.arange(10), made, time)
+    assert "bend" in estimate_drift(test)["component"]
+    assert [(one.target, one.kind) for one in anomalies_of(test)] == [(5, "link")]
