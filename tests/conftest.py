@@ -1,6 +1,8 @@
 """Fixtures shared by all tests: real measured files, a fixed seed for every random generator, and work that workers share."""
 
+import gc
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,8 @@ from fusion.campaign.remote import DatasetError, fetch_sample
 
 def pytest_configure(config):
     """In a new clone each worker begins with other files, whose bytecode the others find, and compiles kernels for all."""
+    # Libraries and tests are some 500,000 objects that stay: looking for garbage among them is a sixth of the time of collecting.
+    gc.set_threshold(50_000)
     work = getattr(config, "workerinput", None)
     if work is None:
         return
@@ -32,6 +36,23 @@ def pytest_configure(config):
         files = sorted((config.rootpath / "tests").rglob("test_*.py"))
         first = len(files) * int(work["workerid"].removeprefix("gw")) // work["workercount"]
         config.args = [str(path) for path in files[first:] + files[:first]]
+
+
+def pytest_collection_finish():
+    """What was collected stays: no search for garbage need go through it."""
+    gc.freeze()
+
+
+#: A file all of whose tests are slow.
+_SLOW = re.compile(r"^pytestmark = (?:\[[^\]]*)?pytest\.mark\.slow\b", re.MULTILINE)
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Where slow tests are left out, their files are not imported; a file that is named is."""
+    left_out = config.getoption("markexpr").startswith("not slow")
+    if left_out and collection_path.suffix == ".py" and _SLOW.search(collection_path.read_text(encoding="utf-8")):
+        return True
+    return None
 
 
 @pytest.fixture
