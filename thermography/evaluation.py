@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from thermofuse.resources import variables
 from thermography.common import Array, ThermographyError
@@ -553,8 +552,11 @@ def count_temperatures(picture: xr.Dataset, region: Region | None = None, *, bin
     """
     import xarray as xr
 
-    values = _values(picture, region)
-    counts, edges = np.histogram(values, bins)
+    values = within_range(picture).values
+    if region is not None:
+        rows, columns, mask = region.pixels((values.shape[0], values.shape[1]))
+        values = values[rows, columns][mask.astype(bool)]
+    counts, edges = np.histogram(values[np.isfinite(values)], bins)
     middles = ("temperature", (edges[:-1] + edges[1:]) / 2, _DEGC)
     return xr.DataArray(counts, dims="temperature", coords={"temperature": middles}, name="pixels", attrs=_PIXELS)
 
@@ -626,12 +628,3 @@ def subtract_frames(later: xr.Dataset, earlier: xr.Dataset) -> xr.DataArray:
         )
     change = within_range(later).drop_vars("time") - within_range(earlier).drop_vars("time")
     return change.rename("temperature_change").assign_attrs({"long_name": "change of temperature", **_KELVIN})
-
-
-def _values(picture: xr.Dataset, region: Region | None) -> NDArray[np.float32]:
-    """Temperatures within the calibrated range of a picture or a region of it."""
-    values = within_range(picture).values
-    if region is not None:
-        rows, columns, mask = region.pixels((values.shape[0], values.shape[1]))
-        values = values[rows, columns][mask.astype(bool)]
-    return values[np.isfinite(values)]

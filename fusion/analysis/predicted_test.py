@@ -11,6 +11,7 @@ from scipy import special
 
 from fusion.common import Array
 from fusion.results.parts import Quantity
+from interferometry.iso230.quantities import axis_quantities
 
 #: Order of the approaches along the first axis of every array.
 APPROACHES = ("positive", "negative")
@@ -79,16 +80,8 @@ def predict_values(
     # Readings that drift and scatter about their mean: squares of normal values that are not about zero.
     variance = np.broadcast_to(np.maximum(scatter_um**2, 1e-12), mean.shape) / (cycles - 1)
     spread = 2.0 * np.sqrt(variance * rng.noncentral_chisquare(cycles - 1, drifted / variance))
-    drawn = {
-        "A": (mean + spread).max(axis=(1, 2)) - (mean - spread).min(axis=(1, 2)),
-        "E": np.ptp(mean, axis=(1, 2)),
-        "M": np.ptp(mean.mean(axis=1), axis=1),
-        "B": np.abs(mean[:, 0] - mean[:, 1]).max(axis=1),
-    }
-    return {
-        symbol: Quantity(value=float(np.median(values)), u=float(values.std(ddof=1)))
-        for symbol, values in drawn.items()
-    }
+    drawn = axis_quantities(mean, spread / 2.0)
+    return {name: Quantity(value=np.median(drawn[name]), u=drawn[name].std(ddof=1)) for name in ("A", "E", "M", "B")}
 
 
 def _with_likely_reversal(left: Array, errors: Array) -> tuple[Array, Array]:

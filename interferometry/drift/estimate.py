@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 import scipy
 import xarray as xr
 from numpy.typing import NDArray
@@ -232,18 +233,14 @@ def estimate_drift(
     """
     deviations = check_dataset(deviations, "deviations")
     # Profiles and covariances are laid out by the index of the approach.
-    ordered = deviations.reindex(direction=list(DIRECTIONS)) if _unordered(deviations) else deviations
+    sides = [str(name) for name in deviations["direction"].values]
+    ordered = deviations if sides == [*DIRECTIONS] else deviations.reindex(direction=list(DIRECTIONS))
     joint = fit_joint(ordered, robust=robust, order=order, components=components)
     found = _describe(ordered, joint, state)
     if ordered is deviations:
         return found
-    place = [DIRECTIONS.index(str(name)) for name in deviations["direction"].values]
+    place = [DIRECTIONS.index(name) for name in sides]
     return found.isel(direction=place, other_direction=place)
-
-
-def _unordered(deviations: xr.Dataset) -> bool:
-    """Whether the approaches are not stored as both, the positive one first."""
-    return tuple(str(name) for name in deviations["direction"].values) != DIRECTIONS
 
 
 def flag_outliers(deviations: xr.Dataset, estimated: xr.Dataset) -> xr.Dataset:
@@ -343,17 +340,8 @@ def _without_medians(readings: xr.Dataset) -> Array:
     passes = readings["cycle"].values * 2 + (readings["sign"].values > 0)
     cells = readings["target"].values * 2 + (readings["sign"].values > 0)
     for groups in (cells, passes):
-        remainder = remainder - _group_medians(groups, remainder)
+        remainder = remainder - pd.Series(remainder).groupby(groups).transform("median").to_numpy()
     return remainder
-
-
-def _group_medians(groups: NDArray[np.int64], values: Array) -> Array:
-    """Return for each value the median of its group, (n,)."""
-    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
-    ordered = values[np.lexsort((values, group))]
-    first = np.cumsum(count) - count
-    medians = 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
-    return np.asarray(medians[group])
 
 
 def _cells(deviations: xr.Dataset, readings: xr.Dataset) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -12,8 +12,8 @@ from scipy import special
 
 from interferometry.common import Array, InterferometryError, check_dataset
 
-#: Shares of the final drift whose times are named t63 and t95.
-SHARES = {"t63": 1 - math.exp(-1), "t95": 0.95}
+#: Share of the final drift after which it counts as settled.
+SETTLED_SHARE = 0.95
 #: A spacing this close to a whole number of leads hides the screw's periodic error.
 SPACING_TOLERANCE = 0.02
 LONGEST_SEARCH_CYCLES = 100_000
@@ -44,21 +44,17 @@ class MeasurementPlan:
 
 @dataclass(frozen=True)
 class Settling:
-    """Time after which an exponential drift component has reached 63 % and 95 % of its final value.
+    """Time after which an exponential drift component has reached 95 % of its final value.
 
     Attributes
     ----------
     component : name of the drift component
-    t63_s, t95_s : since the first reading, s
-    t63_low_s, t63_high_s, t95_low_s, t95_high_s : float
-        Limits of the 95 % confidence intervals, s; infinite where the test is too short to show the end.
+    t95_s : since the first reading, s
+    t95_low_s, t95_high_s : limits of the 95 % confidence interval, s; infinite where the test is too short to show the end
     amplitude_um : final drift where the component's loading is 1, um
     """
 
     component: str
-    t63_s: float
-    t63_low_s: float
-    t63_high_s: float
     t95_s: float
     t95_low_s: float
     t95_high_s: float
@@ -159,7 +155,7 @@ def _largest_relative_u(estimated: xr.Dataset) -> float:
 
 
 def estimate_settling(deviations: xr.Dataset, estimated: xr.Dataset) -> list[Settling]:
-    """Fit one exponential to each drift component: the time until it has reached 63 % and 95 % of its final value."""
+    """Fit one exponential to each drift component: the time until it has reached 95 % of its final value."""
     seconds, series = _cycle_components(deviations, estimated)
     if seconds.size < SHORTEST_TEST_CYCLES:
         return []
@@ -222,15 +218,5 @@ def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling | Non
 
     low, top = math.exp(confidence_limit(grid[0])), confidence_limit(grid[-1])
     high = math.inf if top == grid[-1] else math.exp(top)
-    tau = math.exp(float(best.x))
-    time_constants = {key: -math.log(1 - share) for key, share in SHARES.items()}
-    return Settling(
-        component=name,
-        t63_s=tau * time_constants["t63"],
-        t63_low_s=low * time_constants["t63"],
-        t63_high_s=high * time_constants["t63"],
-        t95_s=tau * time_constants["t95"],
-        t95_low_s=low * time_constants["t95"],
-        t95_high_s=high * time_constants["t95"],
-        amplitude_um=float(coefficients[1]),
-    )
+    times = [tau * -math.log(1 - SETTLED_SHARE) for tau in (math.exp(float(best.x)), low, high)]
+    return Settling(name, *times, amplitude_um=float(coefficients[1]))

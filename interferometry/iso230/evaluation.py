@@ -221,13 +221,13 @@ def evaluate_windows(
     # The results of thousands of windows are very many small objects: those of some windows become one at a time.
     for start in range(0, len(windows), _WINDOWS_AT_ONCE):
         results = [
-            _of_the_axis(
-                evaluate_iso230(deviations, cycles=window, budget=budget, drift=drift, material_degC=material_degC)
-            )
+            evaluate_iso230(deviations, cycles=window, budget=budget, drift=drift, material_degC=material_degC)
             for window in windows[start : start + _WINDOWS_AT_ONCE]
         ]
         names += [result.attrs["window"] for result in results]
-        parts.append(xr.concat(results, dim="window", coords="minimal", compat="override"))
+        # What was found of the axis as a whole, without the values of single targets.
+        of_axis = [one.drop_vars([name for name in one.data_vars if "target" in one[name].dims]) for one in results]
+        parts.append(xr.concat(of_axis, dim="window", coords="minimal", compat="override"))
     joined = parts[0] if len(parts) == 1 else xr.concat(parts, dim="window", coords="minimal", compat="override")
     return joined.assign_coords(
         window=names,
@@ -253,11 +253,6 @@ def accuracy_with_table(deviations: xr.Dataset, drift: xr.DataArray, windows: Se
         mean, s = _mean_and_s(left, np.where(count > 1, count, 0))
         found.append(float(axis_quantities(mean, s)["A"]) if (count == read).all() else np.nan)
     return np.array(found)
-
-
-def _of_the_axis(result: xr.Dataset) -> xr.Dataset:
-    """Return what was found of the axis as a whole, without the values of single targets."""
-    return result[[name for name in result.data_vars if "target" not in result[name].dims]]
 
 
 def _select(deviations: xr.Dataset, cycles: Sequence[int] | None) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from interferometry.common import Array
@@ -54,13 +55,8 @@ def average(seconds: Array, values: Array) -> tuple[Array, Array]:
     samples.
     """
     number = np.floor(seconds / AVERAGED_S).astype(int)
-    numbers, place = np.unique(number, return_inverse=True)
-    known = np.isfinite(values)
-    total, count = np.zeros((2, numbers.size, values.shape[1]))
-    np.add.at(total, place, np.where(known, values, 0.0))
-    np.add.at(count, place, known)
-    time = np.bincount(place, seconds) / np.bincount(place)
-    return time, np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    time, means = (pd.DataFrame(one).groupby(number).mean().to_numpy() for one in (seconds, values))
+    return time[:, 0], means
 
 
 def with_ends(seconds: Array, values: Array, end_s: float) -> tuple[Array, Array]:

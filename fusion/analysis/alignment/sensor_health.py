@@ -69,16 +69,16 @@ class Grid:
         steps = [np.diff(np.unique(column)) for column in self.temperature.T]
         return np.array([max(float(step.min(initial=np.inf)), 1e-9) if step.size else 1.0 for step in steps])
 
-    def switchings(self, begin_s: float, end_s: float) -> tuple[bool, int]:
-        """Whether a load was switched between two times, and how often loads were switched at all other times."""
+    def switched_rarely(self, begin_s: float, end_s: float) -> bool:
+        """Whether a load was switched between two times, and loads too rarely at all other times to compare."""
         if self.drivers.shape[1] == 0:
-            return False, 0
+            return False
         switched = np.max(np.abs(np.diff(self.drivers, axis=0)), axis=1) > _SWITCHED
         # A switching spreads over two blocks.
         first = switched & ~np.r_[False, switched[:-1]]
         times = self.seconds[1:][first]
         inside = (times >= begin_s) & (times <= end_s)
-        return bool(inside.any()), int((~inside).sum())
+        return bool(inside.any() and (~inside).sum() < _LEAST_SWITCHINGS)
 
 
 @dataclass(frozen=True)
@@ -286,6 +286,7 @@ _PREDICTABLE = 0.5
 _RESPONSE = 2.0
 #: A switching is no excuse for what exceeds the response to so many others.
 _LEAST_SWITCHINGS = 3
+_SWITCHED_RARELY = "a load was switched then, too rarely to compare"
 #: A change from one sample to the next, at most so far apart, is faster than any part of a machine warms, s.
 _FAST_S = 60.0
 #: A heater takes longer than this to reach its level, s: only a change from one sample to the next, that close, is none of a heater.
@@ -730,11 +731,11 @@ def _describe(
     at_once = largest >= _AT_ONCE * abs(ramp.size_K)
     kind = Kind.JUMP if at_once else Kind.RAMP
     fast = at_once and fine.step_s <= _FAST_S
-    switched, otherwise = coarse.switchings(ramp.begin_s - 2.0 * coarse.step_s, ramp.end_s + 2.0 * coarse.step_s)
+    near_s = ramp.begin_s - 2.0 * coarse.step_s, ramp.end_s + 2.0 * coarse.step_s
     reasons = {
         "another sensor deviates at the same time": not alone,
         "other sensors respond, so that it may be a source of heat": responding,
-        "a load was switched then, too rarely to compare": switched and otherwise < _LEAST_SWITCHINGS,
+        _SWITCHED_RARELY: coarse.switched_rarely(*near_s),
         "the other sensors predict too little of its signal to distinguish a fault from a heat source": not (
             fast or _shared_by_others(coarse, suspicion.sensor, sound) >= _PREDICTABLE
         ),
@@ -807,9 +808,7 @@ def _noisier(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]
         if apart.max() < _NOISIER:
             continue
         onset, window_s = float(seconds[at * size]), size * float(np.median(np.diff(seconds)))
-        switched, otherwise = grid.switchings(onset - window_s, onset + window_s)
-        rarely = switched and otherwise < _LEAST_SWITCHINGS
-        reason = "a load was switched then, too rarely to compare" if rarely else ""
+        reason = _SWITCHED_RARELY if grid.switched_rarely(onset - window_s, onset + window_s) else ""
         if not reason and apart.max() < limit:
             reason = "the noise of a sound sensor may grow as much near a machine that runs faster"
         held_to = _NOISIER if reason else limit

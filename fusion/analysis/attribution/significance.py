@@ -306,13 +306,8 @@ class Fits:
 
     def take(self, columns: NDArray[np.int64]) -> Fits:
         """The fits of some of the regressors."""
-        return Fits(
-            self.coefficient[:, columns],
-            self.coefficient_u[:, columns],
-            self.score[:, columns],
-            self.freedom,
-            self.null,
-        )
+        of_columns = (one[:, columns] for one in (self.coefficient, self.coefficient_u, self.score))
+        return Fits(*of_columns, self.freedom, self.null)
 
     @property
     def best(self) -> Array:

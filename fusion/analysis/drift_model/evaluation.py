@@ -386,11 +386,6 @@ def exceeds_noise(error_um: float, noise_um: float, share: float) -> bool:
     return error_um**2 > (1.0 + share**2) * noise_um**2
 
 
-def excess_um(error_um: float, noise_um: float) -> float:
-    """What an error holds beside the noise, um."""
-    return float(np.sqrt(max(0.0, error_um**2 - noise_um**2)))
-
-
 def has_skill(error_um: float, last_value_um: float, mean_um: float, noise_um: float, share: float) -> bool:
     """Whether a model predicts the hold-out set better than the last value and the mean of the training part do."""
     return error_um < min(last_value_um, mean_um) or not exceeds_noise(error_um, noise_um, share)
@@ -680,7 +675,8 @@ class LoopResult:
         # The held-out error of a drift that is carried on at its rate says nothing of the size of what drifts.
         # A model that cancels a part of the random drift leaves no more than all of the drift.
         wandering_um = min(self.wandering_um, self._drift_um)
-        size = max(left.rms_um or excess_um(self._errors_um["final"], self.noise_floor_um), wandering_um)
+        beside_noise = max(0.0, self._errors_um["final"] ** 2 - self.noise_floor_um**2) ** 0.5
+        size = max(left.rms_um or beside_noise, wandering_um)
         # What a step without a name describes is not explained either, whether a shape is left beside it or not.
         nameless = [step.rms_um or 0.0 for step, kept in zip(self.steps, self._kept, strict=True) if not kept]
         size = float(np.linalg.norm([size if shape else 0.0, *nameless]))

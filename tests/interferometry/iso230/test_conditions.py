@@ -65,7 +65,7 @@ def test_five_targets_per_metre_are_enough_on_every_travel(start_mm):
 @pytest.mark.parametrize(("t95_s", "met"), [(1000.0, True), (1400.0, False)])
 def test_the_window_must_begin_after_the_warm_up(t95_s, met):
     deviations = at_positions([0.0, 20.0, 45.0, 70.0, 100.0], cycles=7)
-    settling = Settling("stretch", 500.0, 400.0, 600.0, t95_s, 900.0, np.inf, 4.0)
+    settling = Settling("stretch", t95_s, 900.0, np.inf, 4.0)
     check = check_conditions(deviations, cycles=[3, 4, 5, 6, 7], settling=[settling])[-1]
     # Cycle 3 begins 1200 s after the first reading.
     assert check.met is met
