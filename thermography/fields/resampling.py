@@ -122,13 +122,10 @@ def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slic
     return slice(top, bottom + 1), slice(0, columns)
 
 
-def plan_weights(
-    registration: Registration, grid: PlanGrid, *, margin_px: float | None = None, bad: NDArray[np.bool_] | None = None
-) -> PlanWeights:
+def plan_weights(registration: Registration, grid: PlanGrid, *, bad: NDArray[np.bool_] | None = None) -> PlanWeights:
     """Weights of the pixels of a registered camera in the cells of the plan, those of bad pixels (row, column) 0."""
     window = plan_window(registration, grid)
-    margin_px = registration.margin_px if margin_px is None else margin_px
-    cell, pixel, area, x, y = _pieces(registration, grid, window, margin_px)
+    cell, pixel, area, x, y = _pieces(registration, grid, window)
     if bad is not None and bad.any():
         sound = ~bad[window].ravel()[pixel]
         cell, pixel, area, x, y = (values[sound] for values in (cell, pixel, area, x, y))
@@ -149,9 +146,7 @@ def plan_weights(
     return PlanWeights(areas, centring_matrix(offset, coverage, grid), window, coverage, grid)
 
 
-def _pieces(
-    registration: Registration, grid: PlanGrid, window: tuple[slice, slice], margin_px: float
-) -> tuple[Array, ...]:
+def _pieces(registration: Registration, grid: PlanGrid, window: tuple[slice, slice]) -> tuple[Array, ...]:
     """Cut the unmasked pixels of a window at the cells, in two threads: cell, pixel, area (mm2), and mean x and y (mm) per piece."""
     rows, columns = window[0].stop - window[0].start, window[1].stop
     across, down = np.meshgrid(np.arange(columns + 1) - 0.5, np.arange(window[0].start, window[0].stop + 1) - 0.5)
@@ -160,7 +155,7 @@ def _pieces(
     size = (grid.width_mm, grid.height_mm)
     with ThreadPoolExecutor(usable_threads()) as executor:
         halves = executor.map(
-            lambda part: _cut_pixels(corners, part, discs, size, grid.cell_size_mm, margin_px),
+            lambda part: _cut_pixels(corners, part, discs, size, grid.cell_size_mm, registration.margin_px),
             [(0, rows // 2), (rows // 2, rows)],
         )
         return tuple(np.concatenate(both) for both in zip(*halves, strict=True))

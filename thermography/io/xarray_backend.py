@@ -230,10 +230,14 @@ class FlirAccessor:
         )
 
     def _parameters(self) -> list[CameraParameters]:
+        """Return the camera parameters that the Dataset holds: one set, or one per frame where any of them varies."""
         lacking = [name for name, _ in _PARAMETERS.values() if name not in self._dataset]
         if lacking:
             raise RadiometryError(f"the Dataset has no {', '.join(lacking)}; open it with engine='flir' and keep them")
-        return _stored_parameters(self._dataset)
+        values = {field: self._dataset[name].values for field, (name, _) in _PARAMETERS.items()}
+        count = max((value.size for value in values.values() if value.ndim), default=1)
+        spread = {field: np.broadcast_to(value, count) for field, value in values.items()}
+        return [CameraParameters(**{field: float(value[i]) for field, value in spread.items()}) for i in range(count)]
 
     def _references(self, frame: int | None = None) -> list[FlirFrameReference]:
         """Find the frames of the Dataset, or one of them, in their files again."""
@@ -258,14 +262,6 @@ def _parameter_changes(overrides: dict[str, float | None]) -> dict[str, float]:
         for name, value in overrides.items()
         if value is not None
     }
-
-
-def _stored_parameters(dataset: xr.Dataset) -> list[CameraParameters]:
-    """Return the camera parameters that a Dataset holds: one set, or one per frame where any of them varies."""
-    values = {field: dataset[name].values for field, (name, _) in _PARAMETERS.items()}
-    count = max((value.size for value in values.values() if value.ndim), default=1)
-    spread = {field: np.broadcast_to(value, count) for field, value in values.items()}
-    return [CameraParameters(**{field: float(value[i]) for field, value in spread.items()}) for i in range(count)]
 
 
 def _calibrate_each(counts: np.ndarray, which: np.ndarray, parameters: Sequence[CameraParameters]) -> np.ndarray:

@@ -198,7 +198,8 @@ def diagnose_link(fused: xr.Dataset, link: Flagged) -> Diagnosis:
     if jumps.serial_p < LINK_COURSE_LEVEL:
         against.append(say("link_has_a_course", p=jumps.serial_p))
     cause: Cause = "undetermined" if against else "link"
-    ratios = link_ratios(fused, link.target, link.direction)
+    own, other = ratios = link_ratios(fused, link.target, link.direction)
+    beyond = "" if other is None else say("link_behind", other=other)
     size = {"size": jumps.size_um, "expanded_u": 2.0 * jumps.size_u_um}
     return Diagnosis(
         target=link.target,
@@ -215,7 +216,7 @@ def diagnose_link(fused: xr.Dataset, link: Flagged) -> Diagnosis:
         for_it=(
             say("link_jumps", target=link.target, before=before, **size),
             say("link_gain", nats=jumps.gain_nats),
-            _links_sentence(before, ratios),
+            say("links", before=before, own=own) + beyond,
         ),
         against_it=tuple(against),
         check=CAUSES[cause].check if cause == "link" else undetermined_check("link"),
@@ -235,12 +236,6 @@ def link_ratios(fused: xr.Dataset, target: int, direction: str) -> tuple[float |
     ratios: Array = scatter / max(float(np.median(scatter)), 1e-12)
     at = int(np.flatnonzero(along["target"].values == target)[0])
     return (float(ratios[at - 1]) if at else None, float(ratios[at]) if at < ratios.size else None)
-
-
-def _links_sentence(before: int, ratios: tuple[float | None, float | None]) -> str:
-    """Return which of the two links of a target equation (6) shows raised."""
-    own, other = ratios
-    return say("links", before=before, own=own) + ("" if other is None else say("link_behind", other=other))
 
 
 def _fit_explanations(fused: xr.Dataset, target: int, flagged: set[int], seed: int) -> _Case:
