@@ -161,13 +161,6 @@ class DriftFit:
         """What all readings say of the drift at each of them: the residual, smoothed."""
         return self.system.smooth(self.residual()[:, None])
 
-    def drift(self) -> tuple[Array, Array]:
-        """Drift levels at every reading (n, components) and their covariance (n, components, components)."""
-        covariance = self.sigma**2 * self.smoothed.level_covariance
-        for _, share in self.shares():
-            covariance += np.einsum("nip,njp->nij", share.levels, share.levels)
-        return self.smoothed.levels[:, :, 0], covariance
-
     def shares(self) -> Iterator[tuple[Array, Smoothed]]:
         """Parts (p, some) of the coefficients' uncertainty that are independent, of unit variance, and what is smoothed of each."""
         values, vectors = np.linalg.eigh(self.covariance)

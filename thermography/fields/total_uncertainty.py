@@ -155,7 +155,7 @@ def measure_emissivity(
         known.append(KnownState(float(counts.mean()), u_K * slope, celsius, celsius_u))
     estimate = estimate_emissivity(known[0], known[1], parameters)
     u = float(np.hypot(estimate.emissivity_u, estimate.emissivity * camera_scale))
-    if estimate.quality == "undetermined":
+    if not estimate.is_determined:
         raise ThermographyError(
             f"region {outline.name}: the two states give an emissivity of {estimate.emissivity:.3g} with a standard uncertainty of "
             f"{u:.2g}, which is not sufficient; check their temperatures, or take states that differ more"

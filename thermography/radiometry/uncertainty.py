@@ -9,7 +9,6 @@ propagation of distributions (JCGM 101:2008) differs. See ``docs/method/radiomet
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -317,8 +316,6 @@ def root_sum_square(parts: dict[str, Array]) -> Array:
 
 # Emissivity of a region from two states of known temperature.
 
-#: Below this emissivity the reflected radiation exceeds that of the surface.
-_MIN_EMISSIVITY = 0.5
 #: Above this standard uncertainty an estimate does not distinguish surfaces.
 _MAX_U = 0.1
 
@@ -335,16 +332,16 @@ class KnownState:
 
 @dataclass(frozen=True)
 class EmissivityEstimate:
-    """Emissivity of a region with its standard uncertainty, and the reflected apparent temperature, degC, that agrees with the first state.
-
-    "too_reflective": the emissivity may be below 0.5. "undetermined": its standard uncertainty exceeds 0.1, or the states contradict every
-    emissivity from 0 to 1.
-    """
+    """Emissivity of a region with its standard uncertainty."""
 
     emissivity: float
     emissivity_u: float
-    reflected_temperature_degC: float
-    quality: Literal["usable", "too_reflective", "undetermined"]
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether its standard uncertainty is at most 0.1, and the states do not contradict every emissivity from 0 to 1."""
+        low, high = self.emissivity - 2 * self.emissivity_u, self.emissivity + 2 * self.emissivity_u
+        return self.emissivity_u <= _MAX_U and low <= 1 and high > 0
 
 
 def estimate_emissivity(first: KnownState, second: KnownState, parameters: CameraParameters) -> EmissivityEstimate:
@@ -365,24 +362,4 @@ def estimate_emissivity(first: KnownState, second: KnownState, parameters: Camer
             np.linalg.norm(relative_to_temperature * [first.temperature_u_K, second.temperature_u_K]),
         )
     )
-    reflected = _reflected(first, emissivity, float(signals[0]), parameters)
-    return EmissivityEstimate(float(emissivity), u, reflected, _quality(float(emissivity), u))
-
-
-def _quality(emissivity: float, u: float) -> Literal["usable", "too_reflective", "undetermined"]:
-    """Classify an estimate by its interval of plus and minus two standard uncertainties."""
-    if u > _MAX_U or emissivity - 2 * u > 1 or emissivity + 2 * u <= 0:
-        return "undetermined"
-    return "too_reflective" if emissivity - 2 * u < _MIN_EMISSIVITY else "usable"
-
-
-def _reflected(state: KnownState, emissivity: float, signal: float, parameters: CameraParameters) -> float:
-    """Return the reflected apparent temperature (degC) that agrees with a state; NaN where the surface hardly reflects."""
-    if not 0 < emissivity < 0.99:
-        return float("nan")
-    p, tau = parameters, transmission(parameters)
-    scene = state.counts
-    if p.window_transmission < 1:
-        scene -= float((1 - p.window_transmission) * black_body_signal(p.window_temperature_K, p))
-    scene = scene / p.window_transmission - (1 - tau) * float(black_body_signal(p.atmospheric_temperature_K, p))
-    return float(temperature_of_signal((scene / tau - emissivity * signal) / (1 - emissivity), p))
+    return EmissivityEstimate(float(emissivity), u)

@@ -233,10 +233,8 @@ def fit_model(
 
 def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
     """Drift that no static profile and no effect of the model could make."""
-    levels, _ = fit.drift()
-    loadings = fit.system.loadings
-    named = fit.design
-    drift = levels * loadings
+    loadings, named = fit.system.loadings, fit.design
+    drift = fit.smoothed.levels[:, :, 0] * loadings
     if fit.system.order == 2:
         components = loadings.shape[1]
         named, rates = fit.design[:, :-components], fit.design[:, -components:]

@@ -40,6 +40,14 @@ def dense_covariance(seconds, loadings, order, ratios, variance, memory=None):
     return drift, drift + memory.share * shared + (1.0 - memory.share) * np.diag(variance)
 
 
+def drift_of(fit):
+    """Levels of the drift at every reading, and their covariance with that of the coefficients."""
+    covariance = fit.sigma**2 * fit.smoothed.level_covariance
+    for _, share in fit.shares():
+        covariance = covariance + np.einsum("nip,njp->nij", share.levels, share.levels)
+    return fit.smoothed.levels[:, :, 0], covariance
+
+
 @pytest.mark.parametrize("memory", [None, Memory(0.6, 30.0)])
 @pytest.mark.parametrize(("order", "ratios"), [(1, [0.01, 0.02]), (2, [1e-6, 3e-6])])
 def test_agrees_with_dense_generalised_least_squares(rng, order, ratios, memory):
@@ -65,7 +73,7 @@ def test_agrees_with_dense_generalised_least_squares(rng, order, ratios, memory)
     alone = variance if memory is None else (1.0 - memory.share) * variance
     np.testing.assert_allclose(noise, alone * (inverse @ residual), atol=1e-10)
     np.testing.assert_allclose(share, alone**2 * np.diag(inverse), atol=1e-10)
-    levels, covariance = fit.drift()
+    levels, covariance = drift_of(fit)
     np.testing.assert_allclose((levels * loadings).sum(1), drift @ inverse @ residual, atol=1e-9)
     projector = inverse - inverse @ design @ unscaled @ design.T @ inverse
     np.testing.assert_allclose(
@@ -230,7 +238,7 @@ def test_a_process_noise_scale_multiplies_the_variance_of_its_own_steps(rng, ord
     design = fit.design
     beta = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ y)
     np.testing.assert_allclose(fit.coefficients, beta, atol=1e-8)
-    drift, _ = fit.drift()
+    drift, _ = drift_of(fit)
     np.testing.assert_allclose(drift[:, 0], walk @ inverse @ (y - design @ beta), atol=1e-8)
 
 
@@ -336,7 +344,7 @@ def test_many_columns_are_fitted_as_few_are(rng, monkeypatch):
 def test_the_covariance_of_the_drift_holds_that_of_the_coefficients(rng):
     system, y, x = drift_and_columns(rng)
     fit = fit_fixed_effects(system, y, x)
-    levels, covariance = fit.drift()
+    levels, covariance = drift_of(fit)
     smoothed = system.smooth(np.column_stack([y, x]))
     by_coefficient = smoothed.levels[:, :, 1:]
     np.testing.assert_allclose(levels, smoothed.levels[:, :, 0] - by_coefficient @ fit.coefficients, atol=1e-12)

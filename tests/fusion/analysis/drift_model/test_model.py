@@ -147,8 +147,7 @@ def test_the_unexplained_drift_is_what_profile_and_effects_cannot_make(order, rn
     assert np.abs(named.T @ drift).max() < 1e-8 * np.abs(named).max()
     np.testing.assert_allclose(basis @ (basis.T @ named), named, atol=1e-9)
     np.testing.assert_allclose(basis.T @ basis, np.eye(named.shape[1]), atol=1e-12)
-    levels, _ = model.fit.drift()
-    whole = levels * readings.loadings
+    whole = model.fit.smoothed.levels[:, :, 0] * readings.loadings
     if order == 2:
         whole = whole + model.fit.design[:, -2:] * model.fit.coefficients[-2:]
     np.testing.assert_allclose(drift, whole - basis @ (basis.T @ whole), atol=1e-10)
