@@ -15,7 +15,7 @@ from fusion.analysis.consistency.camera import compare_phase
 from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.consistency.clocks import Evidence, Motion, Recording, compare_clocks
 from fusion.analysis.consistency.courses import compare_drift, compare_load, compare_material
-from fusion.analysis.consistency.field_series import field_at, thin_fields
+from fusion.analysis.consistency.material import field_at, thin_fields
 from fusion.pipeline.consistency import Check, run_checks
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe
