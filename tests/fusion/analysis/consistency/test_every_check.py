@@ -18,7 +18,7 @@ from fusion.analysis.consistency.clocks import Motion, Recording, compare_clocks
 from fusion.analysis.consistency.material import field_at, log_with_camera, thin_fields
 from fusion.pipeline.consistency import Check, _worded, run_checks
 from fusion.results.axis import RegistrationPart
-from tests.fusion.analysis.consistency import test_camera, test_logs, test_model, test_readings
+from tests.fusion.analysis.consistency import test_camera, test_deviations, test_logs, test_model
 from tests.fusion.analysis.consistency.twin_fields import FILES, SENSOR_MM, late, recorded, scaled
 from tests.soak.lies.logs import starts
 from thermography.inspection import FileWarning
@@ -31,7 +31,7 @@ def of_readings(change: Callable[[np.ndarray], np.ndarray]) -> Lie:
     """Other deviations (cycle, direction, target)."""
 
     def lie(inputs: Inputs) -> Inputs:
-        test = test_readings.with_deviation(inputs.deviations, change(inputs.deviations["deviation"].values.copy()))
+        test = test_deviations.with_deviation(inputs.deviations, change(inputs.deviations["deviation"].values.copy()))
         return replace(inputs, linear=test, deviations=test)
 
     return lie
@@ -276,7 +276,7 @@ SAID = {
 def sound(campaign_folder: Path) -> dict[str, Inputs]:
     """Inputs that agree, for every phase; what is compared in one check only need not be of one test."""
     files = {"environment_file": "environment.csv", "drivers_file": "drivers.csv", "sensors_file": "sensors.csv"}
-    readings, test = test_readings.sloped(), recorded()
+    readings, test = test_deviations.sloped(), recorded()
     references, _ = index_frames(sorted((campaign_folder / "thermal").iterdir())[:6])
     pictures = with_discs(test_camera.fields())
     x, y = np.array([30.0, 130.0]), np.array([30.0, 70.0])
