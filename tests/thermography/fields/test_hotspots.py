@@ -6,7 +6,8 @@ import xarray as xr
 
 from thermography.common import ThermographyError
 from thermography.fields import hotspots as module
-from thermography.fields.hotspots import detect_hotspots
+from thermography.fields.hotspots import common_part, detect_hotspots, region_series
+from thermography.registration.plan import PolygonError
 
 pytestmark = pytest.mark.long
 
@@ -179,3 +180,64 @@ def test_a_source_is_one_hotspot_over_all_cycles_with_onset_and_end(rng):
     assert (round(second.x_mm / 10), second.cycle) == (16, 5)
     assert (second.onset_cycle, second.end_cycle) == (3, 7)
     assert second.peak_rise_K == pytest.approx(1.5, abs=4 * second.peak_rise_u_K)
+
+
+SQUARE = {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]}
+TIMES = np.datetime64("2026-03-09T06:00:00", "ns") + np.arange(4) * np.timedelta64(60, "s")
+
+
+def stack(function=lambda x, y: x + 10 * y, grow=1.0):
+    x, y = np.meshgrid(X, Y)
+    values = np.stack([function(x, y) + grow * i for i in range(4)])
+    attrs = {"units": "K", "units_metadata": "temperature: difference"}
+    return xr.DataArray(values, dims=("time", "y", "x"), coords={"time": TIMES, "y": Y, "x": X}, attrs=attrs)
+
+
+def test_rectangle_and_triangle_of_a_plane_have_the_mean_of_their_centroid():
+    square = [(101, 41), (199, 41), (199, 99), (101, 99)]
+    triangle = [(200, 30), (500, 30), (200, 150)]
+    series = region_series(stack(), {"square": square, "triangle": triangle})
+    # Shares are counted by 100 points per cell.
+    np.testing.assert_allclose(series["mean"].sel(region="square"), 150 + 10 * 70 + np.arange(4.0), atol=0.3)
+    np.testing.assert_allclose(series["mean"].sel(region="triangle"), 300 + 10 * 70 + np.arange(4.0), atol=1.0)
+    assert series["n"].sel(region="square").values[0] == pytest.approx(98 * 58 / 25, rel=0.01)
+    assert float(series["max"].sel(region="square")[0]) == 197.5 + 10 * 97.5
+    assert float(series["min"].sel(region="square")[0]) == 102.5 + 10 * 42.5
+    assert series["mean"].attrs["units_metadata"] == "temperature: difference"
+
+
+def test_stated_uncertainty_of_a_region_mean_is_its_scatter(rng):
+    fields = xr.concat([stack(grow=0.0)] * 50, "time")
+    noisy = fields + rng.normal(0, 0.014, fields.shape)
+    series = region_series(noisy, SQUARE)
+    scatter = (series["mean"] - region_series(fields, SQUARE)["mean"]).std()
+    # 200 means give their standard deviation to 5 %.
+    assert float(scatter) == pytest.approx(0.014 / 10, rel=0.15)
+    assert float(series["mean_noise_u"].mean()) == pytest.approx(0.014 / 10, rel=0.05)
+
+
+def test_what_all_cells_share_does_not_average_out(rng):
+    rise = stack(grow=0.0) * 0.0 + 5.0 + rng.normal(0, 0.014, (4, 36, 140))
+    fields = xr.Dataset(
+        {
+            "temperature_rise": rise,
+            "temperature_rise_noise_u": rise * 0.0 + 0.014,
+            "temperature_rise_u": rise * 0.0 + np.hypot(0.014, 0.05),
+        }
+    )
+    series = region_series(rise, SQUARE, common_u=common_part(fields, "temperature_rise"))
+    np.testing.assert_allclose(series["mean_u"], np.hypot(0.05, 0.0014), rtol=0.002)
+    assert "mean_u" not in region_series(rise, SQUARE)
+
+
+def test_masked_cells_take_no_part():
+    fields = stack(lambda x, y: np.where((x > 300) & (x < 320), np.nan, 1.0), grow=0.0)
+    series = region_series(fields, {"r": [(280, 50), (340, 50), (340, 100), (280, 100)]})
+    np.testing.assert_allclose(series["mean"], 1.0)
+    np.testing.assert_allclose(series["n"], (60 - 20) * 50 / 25, rtol=0.01)
+
+
+def test_a_region_of_masked_cells_is_refused():
+    fields = stack(lambda x, y: np.where((x > 300) & (x < 320), np.nan, 1.0))
+    with pytest.raises(PolygonError, match="r: all its cells are masked or out of view"):
+        region_series(fields, {"r": [(301, 50), (319, 50), (319, 80), (301, 80)]})
