@@ -254,7 +254,7 @@ def _named_if_damaged(path: Path) -> Iterator[None]:
         yield
     except (FileNotFoundError, IsADirectoryError, PermissionError, FusionError):
         raise
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+    except (OSError, ArithmeticError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         raise DamagedProductError(
             f"{path}: is damaged or no product of thermofuse ({type(error).__name__}); run the campaign again"
         ) from error

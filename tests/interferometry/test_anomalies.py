@@ -143,6 +143,9 @@ def test_the_direction_of_an_excess_is_told_by_the_scatter_of_the_other_position
     assert _scatter_direction(estimated, 0, np.arange(1, 4)) == "negative"
     estimated["scatter"][0, 0] = 8.0
     assert _scatter_direction(estimated, 0, np.arange(1, 4)) == "both"
+    # The scatter of negative approaches is known at the first position alone.
+    estimated["scatter"][1, 1:] = np.nan
+    assert _scatter_direction(estimated, 0, np.arange(1, 4)) == "both"
 
 
 @pytest.mark.parametrize(("share_above", "flagged"), [(0.03, True), (0.031, False)])

@@ -374,7 +374,15 @@ def _find_steps(change: Array, regressors: Array, seconds: Array) -> tuple[list[
         residual = change - regressors @ values
     outlying = np.abs(residual) > _OUTLYING * MAD_TO_SIGMA * np.median(np.abs(residual))
     most = int(_MOST_STEPS * (len(change) - regressors.shape[1]))
-    places = np.flatnonzero(outlying).tolist() if np.count_nonzero(outlying) <= most else []
+
+    def usable(places: list[int]) -> bool:
+        """Whether the changes without a step are enough, and still tell every regressor."""
+        ordinary = np.delete(regressors, places, axis=0)
+        return len(places) <= most and np.linalg.matrix_rank(ordinary) == regressors.shape[1]
+
+    places = np.flatnonzero(outlying).tolist()
+    if not usable(places):
+        places = []
     fit = _fit(change, regressors, places, seconds)
     for _ in range(2 * len(change)):
         limit = fit.limit
@@ -384,8 +392,8 @@ def _find_steps(change: Array, regressors: Array, seconds: Array) -> tuple[list[
         shocks[places] = 0.0
         if places and ratios.min() < limit:
             del places[int(ratios.argmin())]
-        elif shocks.max() > limit and len(places) < most:
-            places = sorted([*places, int(shocks.argmax())])
+        elif shocks.max() > limit and usable(more := sorted([*places, int(shocks.argmax())])):
+            places = more
         else:
             break
         fit = _fit(change, regressors, places, seconds)

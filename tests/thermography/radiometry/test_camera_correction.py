@@ -12,6 +12,7 @@ from thermography.radiometry.camera import (
     Detector,
     LevelSeries,
     _diagonal_of_inverse,
+    _find_steps,
     _fit,
     estimate_correction,
     examine_detector,
@@ -128,6 +129,26 @@ def test_steps_in_a_film_are_placed_to_the_frame():
     offset = np.where(np.arange(3000) >= 1234, -0.3, 0.0)
     (step,) = estimate_correction(_with_camera(series, offset)).steps
     assert step.index == 1234 and step.value_K == pytest.approx(-0.3, abs=0.03)
+
+
+def test_steps_leave_enough_changes_to_tell_a_log_that_ends_early(rng):
+    """The room is logged for five changes, in which the camera behaves unlike later: without them nothing is known of the room."""
+    room = [
+        [0.115, -0.020, -0.012],
+        [0.161, -0.099, -0.003],
+        [-0.028, -0.089, 0.013],
+        [-0.146, 0.008, 0.001],
+        [-0.079, 0.044, -0.008],
+    ]
+    change, regressors = 0.002 * rng.standard_normal(51), np.zeros((51, 4))
+    regressors[:5, :3], regressors[:, 3] = room, 0.25 * np.sin(0.76 * np.arange(51))
+    regressors[:5, 3] = 2.0, 1.3, 1.1, 1.0, 0.7
+    change += 0.68 * regressors[:, 3]
+    change[:5], change[28] = [-0.17, -0.28, 0.05, 0.23, 0.21], 8.7
+    places, fit = _find_steps(change, regressors, np.full(51, 300.0))
+    assert 28 in places
+    assert np.linalg.matrix_rank(np.delete(regressors, places, axis=0)) == 4
+    assert (np.diag(fit.covariance) > 0).all()
 
 
 @pytest.mark.parametrize("frames", [2, 7])
