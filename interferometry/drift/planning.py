@@ -218,5 +218,6 @@ def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling | Non
 
     low, top = math.exp(confidence_limit(grid[0])), confidence_limit(grid[-1])
     high = math.inf if top == grid[-1] else math.exp(top)
-    times = [tau * -math.log(1 - SETTLED_SHARE) for tau in (math.exp(float(best.x)), low, high)]
-    return Settling(name, *times, amplitude_um=float(coefficients[1]))
+    per_tau = -math.log(1 - SETTLED_SHARE)
+    tau = math.exp(float(best.x))
+    return Settling(name, tau * per_tau, low * per_tau, high * per_tau, amplitude_um=float(coefficients[1]))

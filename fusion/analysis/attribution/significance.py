@@ -306,8 +306,10 @@ class Fits:
 
     def take(self, columns: NDArray[np.int64]) -> Fits:
         """The fits of some of the regressors."""
-        of_columns = (one[:, columns] for one in (self.coefficient, self.coefficient_u, self.score))
-        return Fits(*of_columns, self.freedom, self.null)
+        coefficient, coefficient_u, score = (
+            one[:, columns] for one in (self.coefficient, self.coefficient_u, self.score)
+        )
+        return Fits(coefficient, coefficient_u, score, self.freedom, self.null)
 
     @property
     def best(self) -> Array:
