@@ -10,9 +10,9 @@ from bokeh.models import Range1d
 from bokeh.plotting import figure
 from bokeh.util.serialization import make_id
 
-from fusion.app.parts import schedule_update
+from fusion.app.parts import Parts, column, note, paragraph, schedule_update
 from fusion.report.charts.models import Model, document
-from fusion.report.charts.style import new_figure
+from fusion.report.charts.style import Chart, new_figure
 from interferometry.plots import INK
 
 #: First and last value of an axis as it is drawn; a descending pair turns it round.
@@ -71,3 +71,13 @@ def shown_chart(drawn: Model) -> pn.pane.Bokeh:
 def shown_drawing(drawn: figure) -> pn.pane.Bokeh:
     """Return a drawing as wide as the page leaves to it."""
     return pn.pane.Bokeh(drawn, sizing_mode="stretch_width")
+
+
+def shown(chart: Chart, caption: str) -> pn.viewable.Viewable:
+    """Return a chart of the report with its caption and what is seen, in words."""
+    return column(paragraph(caption), shown_chart(chart.figure), note(chart.seen))
+
+
+def shown_if(chart: Chart | None, caption: str) -> Parts:
+    """Return a chart with its caption where there is one."""
+    return [] if chart is None else [shown(chart, caption)]

@@ -11,7 +11,7 @@ import numpy as np
 import panel as pn
 
 from fusion.app import parts as ui
-from fusion.app.results.charts import shown_if
+from fusion.app.drawings import shown_if
 from fusion.campaign.config import load_campaign
 from fusion.common import CAMPAIGN_FILE, FusionError
 from fusion.common.messages import reported

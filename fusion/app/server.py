@@ -182,7 +182,7 @@ _TEMPLATES = Path(__file__).parent / "templates"
 SCREENS = {
     "Set up": ("setup.screen", "set_up"),
     "Run": ("run", "run_screen"),
-    "Results": ("results.screen", "results_screen"),
+    "Results": ("results", "results_screen"),
     "Compare": ("compare", "compare_screen"),
     "Live": ("live", "live_screen"),
 }

@@ -16,8 +16,8 @@ import rich.table
 import xarray as xr
 
 from fusion.report.campaign import DRAWN, describe_iso230, describe_thermal_tests, values_to_sign, verification_table
+from fusion.report.charts.model import draw_thermal_tests
 from fusion.report.charts.readings import has_windows, plot_test, plot_windows
-from fusion.report.charts.record import draw_thermal_tests
 from fusion.report.charts.style import Chart, embed, of_rank
 from fusion.report.letterhead import PLAIN, Letterhead, Translate, translated, translation
 from fusion.report.page import page_format, render_page, write_page

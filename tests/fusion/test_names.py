@@ -25,8 +25,7 @@ from typer.testing import CliRunner
 
 from fusion import cli
 from fusion.app.parts import State
-from fusion.app.results.data import Products
-from fusion.app.results.screen import results_screen
+from fusion.app.results import Products, results_screen
 from fusion.app.setup.screen import SetUpScreen
 from fusion.campaign.config import load_campaign
 from fusion.pipeline.fleet import find_members

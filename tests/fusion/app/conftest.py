@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from fusion.app.results.data import Products
+from fusion.app.results import Products
 from tests.browser import CHROMIUM, record_faults
 
 

@@ -156,7 +156,7 @@ def test_what_a_folder_is_recognised_with_is_loaded_while_the_browser_starts(cam
     code = (
         "import sys, pathlib, importlib; sys.modules['dask'] = None  # as the command has it\nfrom fusion.app.server import AHEAD\n"
         "for name in AHEAD: importlib.import_module(name)\n"
-        "from fusion.app.setup.folder import found_in_folder; before = set(sys.modules)\n"
+        "from fusion.app.setup.screen import found_in_folder; before = set(sys.modules)\n"
         "found_in_folder(pathlib.Path(sys.argv[1])); print(*sorted(set(sys.modules) - before))"
     )
     done = subprocess.run([sys.executable, "-c", code, campaign_folder], capture_output=True, text=True, check=True)

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.report.campaign import describe_campaign
-from fusion.report.charts.record import draw_record
+from fusion.report.charts.model import draw_record
 from fusion.report.page import render_page
 from fusion.results.loop import RecordLoop
 from fusion.results.results import assemble

@@ -7,8 +7,7 @@ from bokeh.events import Tap
 from bokeh.models import LinearColorMapper, Text
 
 from fusion.app.parts import table
-from fusion.app.results.charts import ThermalView, position_readings
-from fusion.app.results.data import Place, Products, Selection
+from fusion.app.results import Place, Products, Selection, ThermalView, position_readings
 from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart
 from fusion.results.results import CorrelationPart

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from fusion.app.results.data import Place, Products, Selection
+from fusion.app.results import Place, Products, Selection
 from fusion.results.results import ResultsError
 from fusion.results.store import DamagedProductError, read_dataset, write_dataset
 

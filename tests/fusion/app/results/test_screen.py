@@ -8,7 +8,7 @@ from zipfile import ZipFile
 
 import pytest
 
-from fusion.app.results.screen import _put, _write_sheet, _write_thermal_sheet
+from fusion.app.results import _put, _write_sheet, _write_thermal_sheet
 from fusion.pipeline.iso230_3 import StatedTests
 from fusion.report.page import ProductsError
 from fusion.results.parts import ThermalTest
@@ -50,7 +50,7 @@ def test_a_sheet_in_word_is_written_and_replaced_whole(products, tmp_path):
 
 def test_a_sheet_that_could_not_say_whose_test_it_was_is_not_written(tmp_path, monkeypatch):
     nameless = StatedTests("T", (ThermalTest.model_construct(conditions=()),), {})
-    monkeypatch.setattr("fusion.app.results.screen.read_thermal_tests", lambda results: nameless)
+    monkeypatch.setattr("fusion.app.results.read_thermal_tests", lambda results: nameless)
     with pytest.raises(ProductsError, match="do not say whose test it was; run the campaign again"):
         _write_thermal_sheet(tmp_path, tmp_path / "sheet.docx")
     assert not list(tmp_path.iterdir())

@@ -8,9 +8,8 @@ import panel as pn
 import pytest
 
 from fusion.app.parts import PathError
-from fusion.app.setup import folder as upload
+from fusion.app.setup import screen
 from fusion.app.setup.campaign import CampaignTextError, open_campaign
-from fusion.app.setup.folder import UploadError, found_in_folder, store_upload
 from fusion.app.setup.form import (
     FieldError,
     Form,
@@ -20,6 +19,7 @@ from fusion.app.setup.form import (
     read_fields,
     write_fields,
 )
+from fusion.app.setup.screen import UploadError, found_in_folder, store_upload
 from fusion.campaign.config import load_campaign
 from fusion.campaign.draft import DraftError
 
@@ -280,7 +280,7 @@ def test_bytes_and_text_are_written_as_they_came(tmp_path):
 
 
 def test_a_large_file_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(upload, "LARGEST_MB", 1)
+    monkeypatch.setattr(screen, "LARGEST_MB", 1)
     with pytest.raises(UploadError, match=r"a\.bin is larger than 1 MB; copy it into .* with the file manager"):
         store_upload(tmp_path, tmp_path, "a.bin", bytes(1_000_001))
     assert not list(tmp_path.iterdir())

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from fusion.app.setup.times import TimesView
+from fusion.app.setup.times import Bar, TimesView, coverage, estimate, recordings_of, shifted
 from fusion.campaign.inspect import Recording, scan_folder
-from fusion.campaign.recordings import Bar, coverage, estimate, recordings_of, shifted
 
 MINUTES = np.datetime64("2026-03-09T06:00", "ns") + np.timedelta64(1, "m") * np.arange(121)
 

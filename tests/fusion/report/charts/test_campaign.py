@@ -12,12 +12,10 @@ from bokeh.palettes import Inferno256, Viridis256
 from fusion.app.drawings import figure_of
 from fusion.report.charts import campaign as campaign_charts
 from fusion.report.charts import model as model_charts
-from fusion.report.charts import record as record_charts
 from fusion.report.charts import style
 from fusion.report.charts.campaign import draw_attributed, draw_campaign, draw_measured, draw_modelled, draw_placed
 from fusion.report.charts.embedded import chart_scripts
-from fusion.report.charts.model import plot_block_errors
-from fusion.report.charts.record import draw_thermal_tests
+from fusion.report.charts.model import draw_thermal_tests, plot_block_errors
 from fusion.report.charts.style import Chart, embed, new_figure
 from fusion.results.numbers import alike, number
 from fusion.results.results import read_results
@@ -248,32 +246,32 @@ def record():
 
 
 def test_prediction_residuals_and_contributions_of_a_record(record):
-    chart = record_charts.plot_prediction(record, "X")
+    chart = model_charts.plot_prediction(record, "X")
     np.testing.assert_array_equal(chart.columns["measured / µm"], record["displacement"].sel(channel="X"))
     (shade,) = parts_of(chart.figure, "BoxAnnotation")
     assert (shade.left, shade.right) == (8.0, 9.0)
-    band = record_charts.plot_prediction(record, "X").columns["95 % band ± / µm"]
+    band = model_charts.plot_prediction(record, "X").columns["95 % band ± / µm"]
     missed = (record["displacement"] - record["predicted_final"]).values[:8]
     np.testing.assert_allclose(band[:8], 2 * np.sqrt(np.mean(missed**2)))
     np.testing.assert_allclose(band[8:], 0.2)
-    columns = record_charts.plot_residuals(record, "X").columns
+    columns = model_charts.plot_residuals(record, "X").columns
     expected = (record["displacement"] - record["predicted_final"]).sel(channel="X")
     np.testing.assert_allclose(columns["measured − final model / µm"], expected)
-    assert list(record_charts.plot_contributions(record, "X").columns)[1:] == ["a b / µm", "c / µm"]
+    assert list(model_charts.plot_channel_contributions(record, "X").columns)[1:] == ["a b / µm", "c / µm"]
 
 
 def test_temperatures_drivers_and_held_out_runs_of_a_record(record):
-    chart = record_charts.plot_temperatures(record)
+    chart = model_charts.plot_temperatures(record)
     names = [item.label["value"] for item in chart.figure.legend.items]
     assert names == ["other sensors", "t5", "t4", "t3", "t2"]
     assert "those that move most are t5, t4, t3 and t2" in chart.seen
-    chart = record_charts.plot_drivers(record)
+    chart = model_charts.plot_drivers(record)
     assert (chart.figure.title.text.text, chart.figure.yaxis.axis_label) == ("speed", "1/min")
     np.testing.assert_allclose(chart.columns["speed / 1/min"][-1], 3000.0)
     two = xr.concat([record, record.assign_coords(driver_name=["load"])], "driver_name", data_vars="minimal")
-    both = record_charts.plot_drivers(two)
+    both = model_charts.plot_drivers(two)
     assert len(both.figure.children) == 2
     runs = record.assign(run=("time", [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]), elapsed=("time", np.arange(10) * 3600.0))
     runs["sealed"] = ("time", np.isin(runs["run"], [2, 5]))
-    shades = list(parts_of(record_charts.plot_residuals(runs, "X").figure, "BoxAnnotation"))
+    shades = list(parts_of(model_charts.plot_residuals(runs, "X").figure, "BoxAnnotation"))
     assert sorted((shade.left, shade.right) for shade in shades) == [(2.0, 3.0), (8.0, 9.0)]

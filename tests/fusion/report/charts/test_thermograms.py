@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.report.charts.campaign import plot_regions, plot_thermogram
 from fusion.report.charts.plan import BEYOND
-from fusion.report.charts.thermograms import plot_regions, plot_thermogram
 from tests.fusion.report.charts.conftest import parts_of
 
 

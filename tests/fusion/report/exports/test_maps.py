@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.report.exports.export import ExportError, export_results
-from fusion.report.exports.maps import CyclePictures
+from fusion.report.exports.export import CyclePictures, ExportError, export_results
 from fusion.results.axis import HotspotPart
 from tests.fusion.report.exports.small_run import write_fields
 
