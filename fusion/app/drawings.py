@@ -11,7 +11,7 @@ from bokeh.plotting import figure
 from bokeh.util.serialization import make_id
 
 from fusion.app.parts import Parts, column, note, paragraph, schedule_update
-from fusion.report.charts.models import Model, document
+from fusion.report.charts.embedded import Model, document
 from fusion.report.charts.style import Chart, new_figure
 from interferometry.plots import INK
 

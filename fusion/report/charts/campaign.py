@@ -16,9 +16,8 @@ from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.common import own_name
 from fusion.report.campaign import leading_region
 from fusion.report.charts import model, plan, readings
-from fusion.report.charts.embedded import Drawn
+from fusion.report.charts.embedded import Drawn, Figure
 from fusion.report.charts.model import draw_record, draw_thermal_tests
-from fusion.report.charts.models import Figure
 from fusion.report.charts.plan import add_marks, add_names, draw_both, draw_picture, plot_thermal_map
 from fusion.report.charts.style import (
     DIVERGING,

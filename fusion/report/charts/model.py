@@ -11,7 +11,7 @@ import xarray as xr
 from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.common import own_name
 from fusion.report.campaign import DRAWN, shown_channels
-from fusion.report.charts.models import Figure, source
+from fusion.report.charts.embedded import Figure, source
 from fusion.report.charts.plan import Extent, add_cells, add_marks, extent_of, new_plan
 from fusion.report.charts.style import (
     BEFORE,

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import xarray as xr
 
-from fusion.report.charts.embedded import MapControls
-from fusion.report.charts.models import Figure, Model, source
+from fusion.report.charts.embedded import Figure, MapControls, Model, source
 from fusion.report.charts.style import (
     CATEGORIES,
     DIVERGING,

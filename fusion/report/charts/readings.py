@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.report.charts.models import Figure, Model, field, source
+from fusion.report.charts.embedded import Figure, Model, field, source
 from fusion.report.charts.style import (
     CATEGORIES,
     MARKERS,

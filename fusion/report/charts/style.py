@@ -13,8 +13,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.common import own_name
-from fusion.report.charts.embedded import EmbeddedChart, in_script
-from fusion.report.charts.models import Figure, Model, document, field, source
+from fusion.report.charts.embedded import EmbeddedChart, Figure, Model, document, field, in_script, source
 from fusion.results.numbers import span
 from interferometry.plots import ACCENT, COLOURS, GRID, INK, MUTED
 

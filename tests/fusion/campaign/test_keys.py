@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from fusion.app.setup.campaign import CampaignText
-from fusion.app.setup.form import form_fields, read_fields, write_fields
+from fusion.app.setup.editor import form_fields, read_fields, write_fields
 from fusion.campaign.config import ReportTable, Table, campaign_schema
 from fusion.campaign.draft import Asker, write_campaign
 from fusion.campaign.schema import Key, keys_of, known_keys

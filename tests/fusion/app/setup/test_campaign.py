@@ -10,7 +10,7 @@ import pytest
 from fusion.app.parts import PathError
 from fusion.app.setup import screen
 from fusion.app.setup.campaign import CampaignTextError, open_campaign
-from fusion.app.setup.form import (
+from fusion.app.setup.editor import (
     FieldError,
     Form,
     direction_text,

@@ -8,8 +8,7 @@ import pytest
 
 from fusion.app.parts import State
 from fusion.app.setup.campaign import open_campaign
-from fusion.app.setup.editor import grid_of, listed_fiducials, open_folder, told_of_check
-from fusion.app.setup.form import read_fields
+from fusion.app.setup.editor import grid_of, listed_fiducials, open_folder, read_fields, told_of_check
 from fusion.app.setup.screen import SetUpScreen
 from fusion.campaign.config import load_campaign
 from fusion.pipeline.check import check_campaign
