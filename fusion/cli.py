@@ -587,7 +587,6 @@ def iso230(
 
     A campaign file adds uncertainties, tolerances and the conditions of the test.
     """
-    from fusion.common import versions
     from fusion.pipeline.iso230 import read_test
     from fusion.report.sheet import describe_sheet, iso230_csv, iso230_json, iso230_tables, write_iso230
     from fusion.report.wording import sentences
@@ -605,9 +604,7 @@ def iso230(
                 _wide().print(table)
             _print_lines([*sentences("decided_how", found.part), *found.remarks])
         if out is not None:
-            sheet = describe_sheet(
-                found.title, found.part, files=found.files, version=versions()["thermofuse"], own=found.sheet
-            )
+            sheet = describe_sheet(found.title, found.part, files=found.files, own=found.sheet)
             write_iso230(out, sheet, found.part, found.dataset, remarks=found.remarks)
             errors.print(f"page: {out.resolve()}")
 
@@ -629,7 +626,6 @@ def verify(
     """
     from dataclasses import asdict
 
-    from fusion.common import versions
     from fusion.pipeline.plan import verify_compensation
     from fusion.report.campaign import verification_table
     from fusion.report.sheet import write_verification
@@ -647,7 +643,7 @@ def verify(
             )
         if out is not None:
             told = (found.test.conditions, found.test.files, found.test.sheet)
-            write_verification(out, found.after, found.channels, found.remarks, *told, version=versions()["thermofuse"])
+            write_verification(out, found.after, found.channels, found.remarks, *told)
             errors.print(f"page: {out.resolve()}")
         _end_unless(all(one.is_kept for one in found.channels))
 
@@ -668,7 +664,6 @@ def iso230_3(
 
     Distortion in the first and the last hour and over the whole test, tilts, drift of zero and scale, settling time.
     """
-    from fusion.common import versions
     from fusion.pipeline.iso230_3 import read_thermal_tests
     from fusion.report.campaign import thermal_test_tables
     from fusion.report.sheet import write_thermal_tests
@@ -682,7 +677,7 @@ def iso230_3(
                 _wide().print(table)
             _print_lines(dict.fromkeys(line for one in tests for line in one.remarks))
         if out is not None:
-            write_thermal_tests(out, title, tests, files=files, version=versions()["thermofuse"], own=own)
+            write_thermal_tests(out, title, tests, files=files, own=own)
             errors.print(f"page: {out.resolve()}")
 
 

@@ -20,7 +20,7 @@ from bokeh.plotting import figure
 from fusion.app import parts as ui
 from fusion.app.drawings import figure_of, shown, shown_chart, shown_drawing, to_scale
 from fusion.app.parts import schedule_update
-from fusion.common import FusionError, versions
+from fusion.common import FusionError
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.charts import readings
@@ -441,7 +441,7 @@ def _put(out: Path, write: Callable[[Path], object]) -> None:
 def _write_sheet(results: Path, out: Path) -> None:
     """Write the test sheet of a run by ISO 230-2."""
     test = read_test(results, None)
-    sheet = describe_sheet(test.title, test.part, files=test.files, version=versions()["thermofuse"], own=test.sheet)
+    sheet = describe_sheet(test.title, test.part, files=test.files, own=test.sheet)
     write_iso230(out, sheet, test.part, test.dataset, remarks=test.remarks)
 
 
@@ -451,7 +451,7 @@ def _write_thermal_sheet(results: Path, out: Path) -> None:
     if not all(one.conditions for one in tests):
         told = "these results are of an earlier version and do not say whose test it was; run the campaign again"
         raise ProductsError(f"{results}: {told}, finished stages are kept")
-    write_thermal_tests(out, title, tests, files=files, version=versions()["thermofuse"], own=own)
+    write_thermal_tests(out, title, tests, files=files, own=own)
 
 
 def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:

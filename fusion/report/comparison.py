@@ -309,9 +309,7 @@ def describe_pair(pair: PairComparison, own: Letterhead = PLAIN) -> Sheet:
         caption="Values by ISO 230-2, expanded uncertainties (k = 2); of the change without what both tests have in common",
         values=_values_as_left(pair),
         notes=sentences("decision_rule") if any(part is not None and part.tolerances for part in parts) else [],
-        requirements=table([], []),
         files=files,
-        version=versions()["thermofuse"],
         own=own,
     ).in_its_language()
 

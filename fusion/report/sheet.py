@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ import pandas as pd
 import rich.table
 import xarray as xr
 
+from fusion.common import versions
 from fusion.report.campaign import DRAWN, describe_iso230, describe_thermal_tests, values_to_sign, verification_table
 from fusion.report.charts.model import draw_thermal_tests
 from fusion.report.charts.readings import has_windows, plot_test, plot_windows
@@ -75,11 +76,11 @@ class Sheet:
     stated: Stated
     caption: str
     values: Table
-    notes: list[str]
-    requirements: Table
     files: Mapping[str, str]
-    version: str
     own: Letterhead = PLAIN
+    notes: Sequence[str] = ()
+    requirements: Table = field(default_factory=lambda: table((), ()))
+    version: str = field(default_factory=lambda: versions()["thermofuse"])
 
     @property
     def tell(self) -> Translate:
@@ -109,9 +110,7 @@ class Sheet:
         )
 
 
-def describe_sheet(
-    title: str, part: Iso230Part, *, files: Mapping[str, str], version: str, own: Letterhead = PLAIN
-) -> Sheet:
+def describe_sheet(title: str, part: Iso230Part, *, files: Mapping[str, str], own: Letterhead = PLAIN) -> Sheet:
     """Return what the sheet of a test by ISO 230-2 shows."""
     requirements = [[check.name, _MET[check.met], check.evidence] for check in part.checks]
     shown = Sheet(
@@ -123,14 +122,13 @@ def describe_sheet(
         notes=sentences("decided_how", part),
         requirements=table([Words("Requirement of ISO 230-2"), Words("Met"), Words("Found")], requirements),
         files=files,
-        version=version,
         own=own,
     )
     return shown.in_its_language()
 
 
 def describe_thermal_sheet(
-    title: str, test: ThermalTest, *, files: Mapping[str, str], version: str, own: Letterhead = PLAIN
+    title: str, test: ThermalTest, *, files: Mapping[str, str], own: Letterhead = PLAIN
 ) -> Sheet:
     """Return what the sheet of a test by ISO 230-3 shows."""
     (described,) = describe_thermal_tests([test])
@@ -140,10 +138,7 @@ def describe_thermal_sheet(
         stated=Stated.of(test.conditions, "not stated"),
         caption="Largest less smallest value, with expanded uncertainty (k = 2)",
         values=described["distortions"],
-        notes=[],
-        requirements=table([], []),
         files=files,
-        version=version,
         own=own,
     )
     return shown.in_its_language()
@@ -157,8 +152,6 @@ def write_verification(
     conditions: Sequence[Iso230Condition],
     files: Mapping[str, str],
     own: Letterhead,
-    *,
-    version: str,
 ) -> None:
     """Write the sheet of a test after a compensation, as found, predicted and achieved; nothing is replaced."""
     shown = Sheet(
@@ -168,15 +161,19 @@ def write_verification(
         caption="Range of the drift; predicted with 95 % interval",
         values=verification_table(verdicts),
         notes=[*(f"{one.name}: {one.fault}: {one.reason}" for one in verdicts if one.fault), *remarks],
-        requirements=table([], []),
         files=files,
-        version=version,
         own=own,
     ).in_its_language()
+    _write(path, lambda: [(shown, None)], lambda: render_page("verification.html.j2", {}, sheet=shown))
+
+
+def _write(path: Path, for_word: Callable[[], Sequence[tuple[Sheet, Axes | None]]], page: Callable[[], str]) -> None:
+    """Write sheets, each with its chart, in the format of the file's name; nothing is replaced."""
     if page_format(path, ".html", ".pdf", ".docx") == ".docx":
-        write_atomically(path, lambda temporary: _write_word(temporary, [(shown, None)]))
+        drawn = for_word()
+        write_atomically(path, lambda temporary: _write_word(temporary, drawn))
     else:
-        write_page(path, render_page("verification.html.j2", {}, sheet=shown))
+        write_page(path, page())
 
 
 def draw_iso230(dataset: xr.Dataset) -> dict[str, Chart]:
@@ -203,11 +200,11 @@ def label(chart: Chart, tell: Translate) -> None:
 
 def write_iso230(path: Path, sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> None:
     """Write the sheet of a test in the format of the file's name; nothing is replaced."""
-    if page_format(path, ".html", ".pdf", ".docx") == ".docx":
-        drawn = plot_iso230(group(dataset, "quoted"), dataset["position"])
-        write_atomically(path, lambda temporary: _write_word(temporary, [(sheet, drawn)]))
-    else:
-        write_page(path, render_iso230(sheet, part, dataset, remarks=remarks))
+    _write(
+        path,
+        lambda: [(sheet, plot_iso230(group(dataset, "quoted"), dataset["position"]))],
+        lambda: render_iso230(sheet, part, dataset, remarks=remarks),
+    )
 
 
 def render_thermal_tests(sheets: Sequence[Sheet], tests: Sequence[ThermalTest]) -> str:
@@ -220,21 +217,12 @@ def render_thermal_tests(sheets: Sequence[Sheet], tests: Sequence[ThermalTest]) 
 
 
 def write_thermal_tests(
-    path: Path,
-    title: str,
-    tests: Sequence[ThermalTest],
-    *,
-    files: Mapping[str, str],
-    version: str,
-    own: Letterhead = PLAIN,
+    path: Path, title: str, tests: Sequence[ThermalTest], *, files: Mapping[str, str], own: Letterhead = PLAIN
 ) -> None:
     """Write the sheets of tests by ISO 230-3 in the format of the file's name; nothing is replaced."""
-    sheets = [describe_thermal_sheet(title, one, files=files, version=version, own=own) for one in tests]
-    if page_format(path, ".html", ".pdf", ".docx") == ".docx":
-        drawn = [(sheet, plot_thermal_test(test)) for sheet, test in zip(sheets, tests, strict=True)]
-        write_atomically(path, lambda temporary: _write_word(temporary, drawn))
-    else:
-        write_page(path, render_thermal_tests(sheets, tests))
+    sheets = [describe_thermal_sheet(title, one, files=files, own=own) for one in tests]
+    drawn = zip(sheets, map(plot_thermal_test, tests), strict=True)
+    _write(path, lambda: [*drawn], lambda: render_thermal_tests(sheets, tests))
 
 
 def plot_thermal_test(test: ThermalTest) -> Axes:

@@ -149,7 +149,7 @@ def published(path: Path, out: Path) -> Results:
     results = run_campaign(without(path, name="judged.toml", added=f"[acceptance]\n{stated}"), out)
     assert 'id="iso230"' in report_of(out)
     test = read_test(out, None)
-    sheet = describe_sheet(test.title, test.part, files=test.files, version="0")
+    sheet = describe_sheet(test.title, test.part, files=test.files)
     assert render_iso230(sheet, test.part, test.dataset, remarks=test.remarks)
     for form in ("csv", "xlsx"):
         assert export_results(out, form, out.with_name(form)).files

@@ -136,13 +136,13 @@ approved_by = "B. Jones"
     )
     title, tests, files, _ = read_thermal_tests(tmp_path / "campaign.toml")
     assert files == {name: file_sha256(tmp_path / name) for name in ("campaign.toml", "record.csv")}
-    sheet = describe_thermal_sheet(title, tests[0], files=files, version="0")
+    sheet = describe_thermal_sheet(title, tests[0], files=files)
     assert dict(sheet.stated.identity) | {"Machine": "Mill 7", "Date of the test": "not stated"} == dict(
         sheet.stated.identity
     )
     assert sheet.stated.signatures == [("Measured by", "A. Smith"), ("Approved by", "B. Jones")]
     for form in ("html", "docx"):
-        write_thermal_tests(tmp_path / f"sheet.{form}", title, tests, files=files, version="0")
+        write_thermal_tests(tmp_path / f"sheet.{form}", title, tests, files=files)
     page = re.sub(r"<script.*?</script>", "", (tmp_path / "sheet.html").read_text(), flags=re.DOTALL)
     written = docx.Document(str(tmp_path / "sheet.docx"))
     cells = [cell.text for table in written.tables for row in table.rows for cell in row.cells]

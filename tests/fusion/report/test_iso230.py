@@ -49,7 +49,7 @@ X = np.random.default_rng(21).normal(0, 0.6, (5, 2, 7)) + np.array([[1.1], [-0.4
 
 def sheet_of(title: str, part: Iso230Part):
     """The sheet of a test read from a file."""
-    return describe_sheet(title, part, files={"x.csv": "ab12"}, version="0")
+    return describe_sheet(title, part, files={"x.csv": "ab12"})
 
 
 def page_of(title: str, part: Iso230Part, dataset: xr.Dataset, *remarks: str) -> str:
@@ -289,7 +289,7 @@ def stated(campaign_folder, tmp_path_factory):
 
 @pytest.mark.chain
 def test_the_demo_states_everything_that_a_sheet_asks_for(stated):
-    sheet = describe_sheet(stated.title, stated.part, files=stated.files, version="0")
+    sheet = describe_sheet(stated.title, stated.part, files=stated.files)
     every = dict([*sheet.stated.identity, *sheet.stated.conditions])
     assert len(every) >= 24 and [name for name, text in every.items() if "not stated" in text] == []
     assert every["Instrument 1"].endswith("calibrated 2026-01-15, certificate C-2026-015")
@@ -336,8 +336,7 @@ def test_a_sheet_is_that_of_the_laboratory_and_in_its_language(stated, tmp_path)
         page_template=str(tmp_path / "lab.html"), language="de",
     )  # fmt: skip
     plain, sheet = (
-        describe_sheet(stated.title, stated.part, files=stated.files, version="0", own=one)
-        for one in (Letterhead(), own)
+        describe_sheet(stated.title, stated.part, files=stated.files, own=one) for one in (Letterhead(), own)
     )
     # Every sentence of the program is in the catalogue; what somebody stated stays as it is, and so do days.
     pairs = zip(
@@ -387,7 +386,7 @@ def test_sentences_are_translated_with_what_stands_in_their_gaps(english, german
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed (Debian: apt-get install chromium)")
 def test_the_sheet_is_one_page_of_a4(stated, tmp_path):
-    sheet = describe_sheet(stated.title, stated.part, files=stated.files, version="0")
+    sheet = describe_sheet(stated.title, stated.part, files=stated.files)
     write_iso230(tmp_path / "sheet.html", sheet, stated.part, stated.dataset, remarks=())
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

@@ -155,7 +155,7 @@ def record_surfaces(spindle, tmp_path_factory) -> Mapping[str, str]:
     folder = shutil.copytree(spindle, tmp_path_factory.mktemp("record") / "spindle")
     title, tests, files, _ = read_thermal_tests(folder / "results")
     for name in ("sheet.html", "sheet.docx"):
-        write_thermal_tests(folder / name, title, tests, files=files, version="0")
+        write_thermal_tests(folder / name, title, tests, files=files)
     shown = printed(*thermal_test_tables(tests, title=title))
     return {**common_surfaces(folder / "results", folder), "iso230-3": shown}
 
@@ -165,7 +165,7 @@ def surfaces(run, tmp_path_factory) -> Mapping[str, str]:
     """The text of every surface."""
     out = tmp_path_factory.mktemp("out")
     test = read_test(run, None)
-    sheet = describe_sheet(test.title, test.part, files=test.files, version="0")
+    sheet = describe_sheet(test.title, test.part, files=test.files)
     for name in ("sheet.html", "sheet.docx"):
         write_iso230(out / name, sheet, test.part, test.dataset, remarks=test.remarks)
     if CHROMIUM:
