@@ -808,44 +808,32 @@ def compare(
     """
     from fusion.pipeline.compare import compare_campaigns
     from fusion.pipeline.iso230 import sheet_of_run
+    from fusion.report import comparison as compared
     from fusion.report.charts.comparison import follow_trends
-    from fusion.report.comparison import (
-        achieved_table,
-        campaign_names,
-        changes_table,
-        comparison_json,
-        comparison_notes,
-        conclude_comparison,
-        conclude_table,
-        describe_places,
-        render_comparison,
-        side_by_side,
-        trend_sentences,
-    )
     from fusion.report.page import write_page
     from fusion.report.wording import print_table
 
     with _answering():
         pairs = compare_campaigns(results, same_setup=same_setup, applied=applied)
         if out is not None:
-            write_page(out, render_comparison(pairs, own=sheet_of_run(results[-1])))
+            write_page(out, compared.render_comparison(pairs, own=sheet_of_run(results[-1])))
             errors.print(f"page: {out.resolve()}")
         if as_json:
-            print_json(comparison_json(pairs))
+            print_json(compared.comparison_json(pairs))
             _end_unless(pairs[0].is_kept)
             return
-        wide, names = _wide(), campaign_names(pairs)
-        wide.print(print_table(side_by_side(pairs), "; ".join(names)))
+        wide, names = _wide(), compared.campaign_names(pairs)
+        wide.print(print_table(compared.side_by_side(pairs), "; ".join(names)))
         for name, pair in zip(names[1:], pairs, strict=True):
             if pair.changes:
-                wide.print(print_table(changes_table(pairs, pair), f"{names[0]} -> {name}"))
+                wide.print(print_table(compared.changes_table(pairs, pair), f"{names[0]} -> {name}"))
             if pair.achieved:
-                wide.print(print_table(achieved_table(pair), "Predicted and achieved"))
-            found = describe_places(pairs, pair)
+                wide.print(print_table(compared.achieved_table(pair), "Predicted and achieved"))
+            found = compared.describe_places(pairs, pair)
             if found and found["table"].rows:
                 wide.print(print_table(found["table"], "Places that the drift follows"))
-            _print_lines([*conclude_table(pair), conclude_comparison(pair), *found.get("said", ())])
-        _print_lines([*trend_sentences(follow_trends(pairs)), *comparison_notes(pairs)])
+            _print_lines([*compared.conclude_table(pair), compared.conclude_comparison(pair), *found.get("said", ())])
+        _print_lines([*compared.trend_sentences(follow_trends(pairs)), *compared.comparison_notes(pairs)])
         _end_unless(pairs[0].is_kept)
 
 

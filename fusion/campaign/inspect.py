@@ -41,17 +41,9 @@ from thermography.inspection import (
     describe_stack,
     inspect_file,
 )
+from thermography.io import other_cameras
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CameraParameters
-from thermography.io.other_cameras import (
-    FrameReader,
-    TemperatureReader,
-    TextReader,
-    find_reader,
-    is_of_flir,
-    name_unread,
-    read_stack,
-)
 from thermography.io.sequence import camera_names
 from thermography.registration.plan import read_fiducials
 
@@ -184,9 +176,9 @@ class Recognised:
             raise FusionError(f"this is not TOML: {error}") from None
 
     @cached_property
-    def reader(self) -> FrameReader | None:
+    def reader(self) -> other_cameras.FrameReader | None:
         """Reader of frames that recognises the file."""
-        return find_reader(self.path)
+        return other_cameras.find_reader(self.path)
 
     @cached_property
     def text(self) -> str | None:
@@ -252,11 +244,11 @@ def _is_campaign(found: Recognised) -> bool:
 
 def _holds_counts(found: Recognised) -> bool:
     reader = found.reader
-    if reader is None and (what := name_unread(found.path)):
+    if reader is None and (what := other_cameras.name_unread(found.path)):
         raise FusionError(what)
-    if reader is None or isinstance(reader, TemperatureReader):
+    if reader is None or isinstance(reader, other_cameras.TemperatureReader):
         return False
-    if not is_of_flir(reader):
+    if not other_cameras.is_of_flir(reader):
         raise FusionError(
             f"counts that the plug-in {reader.name} reads; name the files in thermography.frames, a run reads them"
         )
@@ -267,10 +259,10 @@ def _holds_counts(found: Recognised) -> bool:
 
 
 def _holds_temperatures(found: Recognised) -> bool:
-    if isinstance(found.reader, TextReader):
+    if isinstance(found.reader, other_cameras.TextReader):
         _refuse_list_of_pixels(found)
         return found.text is not None and found.reader.begins_a_frame(found.text)
-    return isinstance(found.reader, TemperatureReader)
+    return isinstance(found.reader, other_cameras.TemperatureReader)
 
 
 def _refuse_list_of_pixels(found: Recognised) -> None:
@@ -287,7 +279,7 @@ def _refuse_list_of_pixels(found: Recognised) -> None:
 def _may_hold_a_frame(found: Recognised) -> bool:
     # Hundreds of columns with a time among their names are a logged table.
     named = len(found.first_line) >= _NAMED and any(map(is_time, found.first_line))
-    return isinstance(found.reader, TextReader) and not named and found.reader.holds_a_frame(found.path)
+    return isinstance(found.reader, other_cameras.TextReader) and not named and found.reader.holds_a_frame(found.path)
 
 
 def _is_lens(found: Recognised) -> bool:
@@ -525,8 +517,8 @@ class Kind(Enum):
     CAMPAIGN = FileKind("campaign file", _is_campaign, lambda path: fusion.load_campaign(path), _describe_campaign)
     FRAMES = FileKind("thermal frames", _holds_counts, inspect_file, _describe_frames, "thermography.frames")
     STACK = FileKind(
-        "frames of temperatures", _holds_temperatures, read_stack, lambda found: describe_stack(found.content), "thermography.frames",
-        may_be=lambda found: _may_hold_a_frame(found),
+        "frames of temperatures", _holds_temperatures, other_cameras.read_stack, lambda found: describe_stack(found.content),
+        "thermography.frames", may_be=lambda found: _may_hold_a_frame(found),
         unused=", not mixed with the frames of a FLIR camera",
     )  # fmt: skip
     LENS = FileKind(
@@ -678,7 +670,7 @@ def thermal_series(paths: Iterable[Path]) -> dict[tuple[Path, str], list[Path]]:
 def is_thermal(path: Path) -> bool:
     """Return whether a path is a file of a FLIR camera that can be opened."""
     try:
-        return path.is_file() and is_of_flir(find_reader(path))
+        return path.is_file() and other_cameras.is_of_flir(other_cameras.find_reader(path))
     except OSError:
         return False
 

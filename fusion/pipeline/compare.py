@@ -29,22 +29,11 @@ from fusion.report.comparison import (
 )
 from fusion.report.page import report_of
 from fusion.report.wording import effect_words, say
+from fusion.results import store
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import number
 from fusion.results.parts import read_table_prediction
 from fusion.results.results import read_results
-from fusion.results.store import (
-    StageStamps,
-    file_sha256,
-    group,
-    has,
-    read_fusion,
-    read_json_object,
-    read_product,
-    write_dataset,
-    write_json,
-    write_text,
-)
 
 
 def compare_campaigns(
@@ -78,28 +67,30 @@ def compare_campaigns(
 def read_campaign(folder: Path) -> ComparedCampaign:
     """Read what a comparison needs of a results folder; the fields of the camera are not read."""
     results = read_results(folder)
-    maps = None if results.correlation is None else read_fusion(folder).children.get("correlation")
+    maps = None if results.correlation is None else store.read_fusion(folder).children.get("correlation")
     drift = _drift(folder)
     record = None
     if isinstance(results.loop, RecordLoop):
-        record = read_product(folder, "record")
+        record = store.read_product(folder, "record")
         record = record.assign(displacement=record["displacement"] - events_of(record, results.loop).sum(axis=0))
-    return ComparedCampaign(results, file_sha256(folder / "results.json"), _axis(folder), drift, maps, record)
+    return ComparedCampaign(results, store.file_sha256(folder / "results.json"), _axis(folder), drift, maps, record)
 
 
 def _axis(folder: Path) -> str:
     """Return the name of the axis as the run noted it."""
     try:
-        return str(read_json_object(folder / "provenance.json")["parameters"]["campaign"].get("axis") or "")
+        return str(store.read_json_object(folder / "provenance.json")["parameters"]["campaign"].get("axis") or "")
     except (KeyError, TypeError, AttributeError):
         return ""
 
 
 def _drift(folder: Path) -> xr.Dataset | None:
     """Return the joint estimate of deviations.nc with its positions; of what belongs to single readings the drift alone."""
-    if not (folder / "deviations.nc").is_file() or not has(read := read_product(folder, "deviations"), "estimate"):
+    if not (folder / "deviations.nc").is_file() or not store.has(
+        read := store.read_product(folder, "deviations"), "estimate"
+    ):
         return None
-    drift = group(read, "estimate").assign(position=read["position"])
+    drift = store.group(read, "estimate").assign(position=read["position"])
     return drift.drop_vars([name for name in drift if "cycle" in drift[name].dims and name != "drift"])
 
 
@@ -126,15 +117,15 @@ def compare_runs(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     if isinstance(pair.before.results.loop, RecordLoop):
         return _compare_records(pair, out)
     rows, titles = [], [one.results.campaign for one in (pair.before, pair.after)]
-    write_json(out / "joint.json", {"campaigns": titles, **places_json(pairs, pair)})
+    store.write_json(out / "joint.json", {"campaigns": titles, **places_json(pairs, pair)})
     reports = [Path(os.path.relpath(folder, out), "report.html").as_posix() for folder in folders]
-    write_text(out / "joint.html", render_comparison(pairs, reports=reports, own=sheet_of_run(folders[-1])))
+    store.write_text(out / "joint.html", render_comparison(pairs, reports=reports, own=sheet_of_run(folders[-1])))
     if pair.places is not None:
-        write_dataset(out / "joint.nc", pair.places.maps)
+        store.write_dataset(out / "joint.nc", pair.places.maps)
         found = describe_places(pairs, pair)
         for folder, other in zip(folders, reversed(names), strict=True):
-            page = write_text(folder / "report.html", report_of(folder, joint={"other": other, **found}))
-            StageStamps(folder).renew(page)
+            page = store.write_text(folder / "report.html", report_of(folder, joint={"other": other, **found}))
+            store.StageStamps(folder).renew(page)
         rows = [("together", " ".join(found["said"]))]
         for place, where, *shown, verdict in (row.cells for row in found["table"].rows):
             each = "; ".join(f"{name}: {text}" for name, text in zip(names, shown, strict=True))
@@ -152,7 +143,7 @@ def _compare_records(pair: PairComparison, out: Path) -> list[tuple[str, str]]:
     figures = [{"title": title, **{key: getattr(loop, key) for key in _FIGURES}} for title, loop in loops.values()]
     agreement = [{"effect": name, "shown_by": who, "agrees": len(who) == 2} for name, who in shown_by.items()]
     titles = [one.campaign for one in tests]
-    write_json(out / "joint.json", {"campaigns": titles, "records": figures, "agreement": agreement})
+    store.write_json(out / "joint.json", {"campaigns": titles, "records": figures, "agreement": agreement})
     rows = []
     for title, loop in loops.values():
         errors = f"{number(loop.rmse_declared_um, 3)} -> {number(loop.rmse_final_um, 3)} µm"

@@ -21,25 +21,9 @@ from fusion.analysis.effects.library import GROUP, describe_code, plugins
 from fusion.campaign.config import Campaign
 from fusion.common import place_within, versions
 from fusion.pipeline.workers import Worker
+from fusion.results import store
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Parts, Results, read_results
-from fusion.results.store import (
-    OutputError,
-    Product,
-    StageStamps,
-    annotate,
-    digest,
-    file_sha256,
-    in_groups,
-    is_file_list,
-    open_dataset,
-    read_dataset,
-    read_grouped,
-    read_json_object,
-    read_tree,
-    retitle,
-    write_dataset,
-)
 from thermography.io.other_cameras import ENTRY_POINT_GROUP
 
 if TYPE_CHECKING:
@@ -60,7 +44,7 @@ def hash_files(files: Mapping[str, Path], *, report: Report = silent) -> dict[st
     hashed = {}
     for done, (name, path) in enumerate(files.items()):
         report("input files", done, len(files))
-        hashed[name] = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+        hashed[name] = {"bytes": path.stat().st_size, "sha256": store.file_sha256(path)}
     report("input files", len(files), len(files))
     return hashed
 
@@ -70,12 +54,12 @@ def dependencies() -> tuple[int, dict[str, str], list[dict[str, Any]]]:
     groups = [*([GROUP] if plugins() else []), ENTRY_POINT_GROUP]
     added = [plugin for group in groups for plugin in describe_code(group)]
     for plugin in added:
-        plugin["code"] = [file_sha256(path) for path in plugin["code"]]
+        plugin["code"] = [store.file_sha256(path) for path in plugin["code"]]
     return PRODUCT_LAYOUT, versions(), added
 
 
 def stamp_run(
-    stamps: StageStamps, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]], products: Sequence[Path]
+    stamps: store.StageStamps, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]], products: Sequence[Path]
 ) -> None:
     """Stamp that a run is whole, so that `kept_results` knows it again."""
     stamps.record(_REPORT, _run_key(campaign), products, {"inputs": inputs})
@@ -83,7 +67,7 @@ def stamp_run(
 
 def kept_results(campaign: Campaign, folder: Path) -> Results | None:
     """Return the results of a whole run of the same campaign from the same input, or None where anything has to be done."""
-    stamps = StageStamps(folder)
+    stamps = store.StageStamps(folder)
     if not stamps.done(_REPORT, _run_key(campaign)):
         return None
     noted, files = stamps.note(_REPORT)["inputs"], campaign.input_files()
@@ -93,13 +77,13 @@ def kept_results(campaign: Campaign, folder: Path) -> Results | None:
     return read_results(folder)
 
 
-def forget_run(stamps: StageStamps) -> None:
+def forget_run(stamps: store.StageStamps) -> None:
     """Take the stamp of a whole run away, before its products are written again."""
     stamps.forget(_REPORT)
 
 
 def _run_key(campaign: Campaign) -> str:
-    return digest(_REPORT, dependencies(), campaign.model_dump(mode="json", exclude={"path"}))
+    return store.digest(_REPORT, dependencies(), campaign.model_dump(mode="json", exclude={"path"}))
 
 
 @dataclass(frozen=True)
@@ -145,9 +129,9 @@ def refuse_other_campaign(folder: Path, campaign: Campaign, inputs: Mapping[str,
     One of the same recordings, by a campaign file that is still there, replaces them with a warning: so one changed file after the other
     is tried on what is kept.
     """
-    known = read_json_object(folder / "provenance.json")
+    known = store.read_json_object(folder / "provenance.json")
     here, there = _place_from(folder, campaign.path), known.get("campaign_file")
-    if not is_file_list(known.get("inputs")) or not isinstance(there, str) or here in (None, there):
+    if not store.is_file_list(known.get("inputs")) or not isinstance(there, str) or here in (None, there):
         return
     tables = ("thermography", "interferometry", "record")
     recordings = {inputs[name]["sha256"] for table in tables for name in campaign.files_of(table) if name in inputs}
@@ -158,7 +142,7 @@ def refuse_other_campaign(folder: Path, campaign: Campaign, inputs: Mapping[str,
         if noted_campaign(folder) is not None:
             _log.warning("%s held the results of %s, which those of %s replace", folder, named, campaign.path)
         return
-    raise OutputError(
+    raise store.OutputError(
         f"{folder} holds the results of another campaign ({named}), which --resume would replace by those of "
         f'{campaign.path} ("{campaign.campaign.title}"); name another folder with --out, or remove this one first'
     )
@@ -203,7 +187,7 @@ def _place_from(folder: Path, campaign: Path) -> str | None:
 
 def noted_campaign(folder: Path) -> Path | None:
     """Return the campaign file where the run of a results folder found it; None where it is not noted, or no longer there."""
-    place, folder = read_json_object(folder / "provenance.json").get("campaign_file"), folder.resolve()
+    place, folder = store.read_json_object(folder / "provenance.json").get("campaign_file"), folder.resolve()
     path = place_within(folder.parent, f"{folder.name}/{place}") if isinstance(place, str) else None
     # A name that is too long for a file is an error of the system.
     with suppress(OSError):
@@ -245,24 +229,28 @@ _ZONED = {"interferometry", "sensors", "drivers", "record"}
 _CORRELATED = ("plan", "interferometry", "drivers")
 _MODELLED = ("plan", "interferometry", "sensors", "drivers", "model")
 STAGES = {
-    "thermograms": Stage("thermograms", "thermograms.nc", ("thermography", "plan"), (), read_dataset),
-    "fields": Stage("thermal fields", "fields.nc", ("thermography", "plan"), (), open_dataset),
-    "deviations": Stage("deviations", "deviations.nc", ("interferometry",), ("fields",), read_grouped),
-    "correlation": Stage("correlation", ".stages/correlation.nc", _CORRELATED, ("fields", "deviations"), read_tree),
-    "model": Stage("anomalies and closed loop", ".stages/model.nc", _MODELLED, ("fields", "deviations"), read_dataset),
-    "record": Stage("closed loop on the record", "fusion.nc", ("record", "model"), (), read_dataset),
+    "thermograms": Stage("thermograms", "thermograms.nc", ("thermography", "plan"), (), store.read_dataset),
+    "fields": Stage("thermal fields", "fields.nc", ("thermography", "plan"), (), store.open_dataset),
+    "deviations": Stage("deviations", "deviations.nc", ("interferometry",), ("fields",), store.read_grouped),
+    "correlation": Stage(
+        "correlation", ".stages/correlation.nc", _CORRELATED, ("fields", "deviations"), store.read_tree
+    ),
+    "model": Stage(
+        "anomalies and closed loop", ".stages/model.nc", _MODELLED, ("fields", "deviations"), store.read_dataset
+    ),
+    "record": Stage("closed loop on the record", "fusion.nc", ("record", "model"), (), store.read_dataset),
 }
 
 
-def _timed(compute: Callable[..., Outcome[Product]], *, report: Report) -> tuple[Outcome[Product], float]:
+def _timed(compute: Callable[..., Outcome[store.Product]], *, report: Report) -> tuple[Outcome[store.Product], float]:
     """Compute a stage; return the wall time that it took too, s."""
     begun = time.monotonic()
     return compute(report=report), time.monotonic() - begun
 
 
 def _timed_and_drawn(
-    compute: Callable[..., Outcome[Product]], draw: Callable[[Outcome[Product]], Drawn], *, report: Report
-) -> tuple[tuple[Outcome[Product], float], Drawn | None]:
+    compute: Callable[..., Outcome[store.Product]], draw: Callable[[Outcome[store.Product]], Drawn], *, report: Report
+) -> tuple[tuple[Outcome[store.Product], float], Drawn | None]:
     """Compute a stage, and draw what it found where that is at hand; see `_timed`. A chart that cannot be drawn costs no result."""
     outcome, spent_s = _timed(compute, report=report)
     try:
@@ -300,7 +288,7 @@ class Run:
     campaign: Campaign
     folder: Path
     report: Report
-    stamps: StageStamps
+    stamps: store.StageStamps
     inputs: Mapping[str, Mapping[str, Any]]
     seen: Mapping[str, FileState]
     started: datetime
@@ -347,7 +335,7 @@ class Run:
         """Return what is kept of a stage, under the title and the inputs of this run."""
         note, path = self.stamps.note(name), self.folder / STAGES[name].file
         notices = tuple(Notice(**item) for item in note["notices"])
-        if retitle(path, self._described):
+        if store.retitle(path, self._described):
             self.stamps.renew(path)
         return Outcome(STAGES[name].read(path), Parts.model_validate(note["parts"]), notices)
 
@@ -363,7 +351,7 @@ class Run:
             computed, spent_s = compute()
             begun = time.monotonic()
             outcome = replace(computed, dataset=self.described(computed.dataset))
-            write_dataset(path, in_groups(outcome.dataset) if name == "deviations" else outcome.dataset)
+            store.write_dataset(path, store.in_groups(outcome.dataset) if name == "deviations" else outcome.dataset)
             found = {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
             self.stamps.record(name, key, [path], found)
             del computed
@@ -377,7 +365,7 @@ class Run:
 
     def _key(self, name: str) -> str:
         """Return a digest of everything that the product of a stage depends on."""
-        return digest(self._shared_key(name), self.taken.get(name))
+        return store.digest(self._shared_key(name), self.taken.get(name))
 
     def _shared_key(self, name: str) -> str:
         """Return a digest of what the result of a stage depends on as far as later stages use it."""
@@ -386,7 +374,7 @@ class Run:
         files = {file: self.inputs[file] for table in stage.tables for file in self.campaign.files_of(table)}
         zone = self.campaign.campaign.time_zone if _ZONED & {*stage.tables} else None
         earlier = [self.keys[one] for one in stage.after if one in self.keys]
-        return digest(name, *self.depends, zone, settings, files, earlier)
+        return store.digest(name, *self.depends, zone, settings, files, earlier)
 
     def checkpoint(self, name: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
@@ -396,10 +384,10 @@ class Run:
                 shutil.rmtree(stale)
         return chosen
 
-    def described(self, product: Product) -> Product:
+    def described(self, product: store.Product) -> store.Product:
         """Return a product with title, history and provenance."""
         history = f"{self.started.isoformat(timespec='seconds')} thermofuse run {self.campaign.path.name}"
-        return annotate(product, history=history, **self._described)
+        return store.annotate(product, history=history, **self._described)
 
     @property
     def _described(self) -> dict[str, str]:

@@ -29,19 +29,7 @@ from fusion.campaign.inputs import (
 from fusion.campaign.remote import fetched_campaign, is_address, require_outside_cache
 from fusion.campaign.time_zones import time_part
 from fusion.common.messages import naming
-from fusion.pipeline import attribution, drift_model, positioning, thermal
-from fusion.pipeline.consistency import (
-    Check,
-    check_fields,
-    check_loop,
-    check_plan,
-    check_source,
-    doubt_notices,
-    inputs_part,
-    is_doubted_clock,
-    refuse_contradictions,
-    without_consequences,
-)
+from fusion.pipeline import attribution, consistency, drift_model, positioning, thermal
 from fusion.pipeline.iso230 import complete_sheet
 from fusion.pipeline.iso230_3 import thermal_tests
 from fusion.pipeline.record import RecordSource, model_record, read_record_source
@@ -157,16 +145,16 @@ def _run_loaded(
     seen = input_states(campaign)
     report("reading and checking", 0, 1)
     made: dict[str, Any] = {"scheduler": scheduler}
-    checks: list[Check] = []
+    checks: list[consistency.Check] = []
     laser = campaign.interferometry
     if campaign.record is not None:
         with naming(campaign.path):
             made["record_source"] = read_record_source(campaign)
     else:
         source = read_source(campaign)
-        checks = check_source(source)
+        checks = consistency.check_source(source)
         with naming(campaign.path):
-            refuse_contradictions(without_consequences(checks, campaign.accept.doubts))
+            consistency.refuse_contradictions(consistency.without_consequences(checks, campaign.accept.doubts))
         made["source"] = source
         made |= {"camera": source} if isinstance(source, CameraInputs) else {}
         made |= {"laser": source} if isinstance(source, LaserInputs) else {"alone": source}
@@ -187,11 +175,11 @@ def _run_loaded(
             run.notices.extend(made["source"].notices if "source" in made else ())
             run_stages(run, RUN, made)
             if "source" in made:
-                checks = without_consequences([*checks, *made["checks"]], campaign.accept.doubts)
-                doubts = doubt_notices(checks, campaign.accept.doubts)
+                checks = consistency.without_consequences([*checks, *made["checks"]], campaign.accept.doubts)
+                doubts = consistency.doubt_notices(checks, campaign.accept.doubts)
                 run.notices = [*doubts, *_without_following(run.notices, checks)]
                 corrected = run.parts.camera is not None and camera_corrected(run.parts.camera)
-                run.parts.inputs = inputs_part(checks, campaign.accept.doubts, corrected=corrected)
+                run.parts.inputs = consistency.inputs_part(checks, campaign.accept.doubts, corrected=corrected)
             return _finish(run, made)
         except BaseException:
             # Nobody is left behind who writes into the folder.
@@ -199,9 +187,9 @@ def _run_loaded(
             raise
 
 
-def _without_following(notices: Sequence[Notice], checks: Sequence[Check]) -> list[Notice]:
+def _without_following(notices: Sequence[Notice], checks: Sequence[consistency.Check]) -> list[Notice]:
     """Take the remedy from notices of what a doubted clock does by itself."""
-    doubted = any(is_doubted_clock(check) for check in checks)
+    doubted = any(consistency.is_doubted_clock(check) for check in checks)
     return [replace(one, remedy="") if doubted and one.code in FOLLOWING_NOTICES else one for one in notices]
 
 
@@ -328,11 +316,13 @@ def _begin_charts(
     run.draw(partial(_draw, "measured", fields, deviations, fused))
 
 
-def _begin_checks(run: Run, camera: CameraInputs, fields: xr.Dataset, fused: Maybe = None) -> Callable[[], list[Check]]:
+def _begin_checks(
+    run: Run, camera: CameraInputs, fields: xr.Dataset, fused: Maybe = None
+) -> Callable[[], list[consistency.Check]]:
     """Begin to check the fields."""
     if isinstance(camera, Source) and fused is not None:
-        return run.worker.submit(partial(check_fields, _without_frames(camera), fields, fused))
-    return partial(check_fields, camera, fields)
+        return run.worker.submit(partial(consistency.check_fields, _without_frames(camera), fields, fused))
+    return partial(consistency.check_fields, camera, fields)
 
 
 def _begin_maps(run: Run, fields: xr.Dataset) -> Callable[[], object]:
@@ -387,19 +377,19 @@ def _write_fusion(
 def _check(
     run: Run,
     source: Inputs,
-    field_checks: Callable[[], list[Check]] | None = None,
+    field_checks: Callable[[], list[consistency.Check]] | None = None,
     maps_written: Callable[[], object] | None = None,
     model: Maybe = None,
-) -> list[Check]:
+) -> list[consistency.Check]:
     """What the checks of registration, fields and model found; the maps are written by then."""
-    checks: list[Check] = []
+    checks: list[consistency.Check] = []
     if field_checks is not None and maps_written is not None:
         maps_written()
         assert isinstance(source, CameraInputs)
-        checks += [*check_plan(source, run.parts.registration), *field_checks()]
+        checks += [*consistency.check_plan(source, run.parts.registration), *field_checks()]
     if model is not None:
         assert isinstance(source, LaserInputs)
-        checks += check_loop(plain(run.parts.loop), source)
+        checks += consistency.check_loop(plain(run.parts.loop), source)
     return checks
 
 

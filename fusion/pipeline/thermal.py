@@ -37,6 +37,7 @@ from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome, Parts
 from fusion.results.store import check
 from thermography.common import FIELDS, ZERO_CELSIUS_K, ThermographyError
+from thermography.fields import total_uncertainty
 from thermography.fields.cycle_fields import CLIPPED, annotate, cycles_with_field, reference_cycle
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.objects import describe_unnamed_surfaces, leave_out_objects
@@ -50,16 +51,6 @@ from thermography.fields.survey import (
     locate_blocks,
     read_discs,
     survey_frames,
-)
-from thermography.fields.total_uncertainty import (
-    EmissivityRegion,
-    Surface,
-    calibrate_surfaces,
-    compare_with_monte_carlo,
-    evaluate_uncertainty,
-    find_range,
-    find_surfaces,
-    measure_emissivity,
 )
 from thermography.io.files import write_maps
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
@@ -458,10 +449,14 @@ def complete_fields(
     if table.reflected_change_u_K is not None:
         fields = fields.drop_vars("reflected_change_u", errors="ignore")
     regions = [_emissivity_region(one, fields, camera, inputs) for one in table.surfaces]
-    surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)
+    surfaces, edge = total_uncertainty.find_surfaces(
+        fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity
+    )
     if regions:
-        fields = calibrate_surfaces(fields, surfaces, edge, cameras)
-    fields = evaluate_uncertainty(fields, cameras["cycle"], inputs, surfaces=surfaces if regions else ())
+        fields = total_uncertainty.calibrate_surfaces(fields, surfaces, edge, cameras)
+    fields = total_uncertainty.evaluate_uncertainty(
+        fields, cameras["cycle"], inputs, surfaces=surfaces if regions else ()
+    )
     part = RadiometryPart(
         temperature_u=_two_parts(fields, "temperature"),
         rise_u=_two_parts(fields, "temperature_rise"),
@@ -515,16 +510,16 @@ def _parameters_at(
 
 def _emissivity_region(
     table: RegionTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
-) -> EmissivityRegion:
+) -> total_uncertainty.EmissivityRegion:
     """One region of the campaign file, its emissivity measured from two states where it is not given."""
     outline = Polygon(f"region {table.name}", np.array(table.corners))
     if table.states is None:
         assert table.emissivity is not None
         u = inputs.emissivity if table.emissivity_u is None else table.emissivity_u
-        return EmissivityRegion(outline, table.emissivity, u)
+        return total_uncertainty.EmissivityRegion(outline, table.emissivity, u)
     states = [(state.cycle, state.temperature_degC, state.temperature_u_K) for state in table.states]
-    estimate = measure_emissivity(fields, outline, states, camera, camera_scale=inputs.camera_scale)
-    return EmissivityRegion(outline, min(estimate.emissivity, 1.0), estimate.emissivity_u)
+    estimate = total_uncertainty.measure_emissivity(fields, outline, states, camera, camera_scale=inputs.camera_scale)
+    return total_uncertainty.EmissivityRegion(outline, min(estimate.emissivity, 1.0), estimate.emissivity_u)
 
 
 def _two_parts(fields: xr.Dataset, name: str) -> TwoParts:
@@ -593,15 +588,21 @@ def _drift_notices(table: ThermographyTable, fields: xr.Dataset) -> Iterator[Not
 
 
 def _describe_surface(
-    table: ThermographyTable, surface: Surface, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
+    table: ThermographyTable,
+    surface: total_uncertainty.Surface,
+    fields: xr.Dataset,
+    camera: CameraParameters,
+    inputs: InputUncertainty,
 ) -> SurfacePart:
     """A surface with its emissivity and what it leaves of the rises."""
-    shown = find_range(fields, surface.cells)
+    shown = total_uncertainty.find_range(fields, surface.cells)
     sources = {f"region {one.name}": "stated" if one.states is None else "two states" for one in table.surfaces}
     ratio = scale = None
     if shown is not None:
         own = replace(inputs, emissivity=surface.emissivity_u)
-        compared = compare_with_monte_carlo(shown, override(camera, emissivity=surface.emissivity), own)
+        compared = total_uncertainty.compare_with_monte_carlo(
+            shown, override(camera, emissivity=surface.emissivity), own
+        )
         ratio, scale = compared.rise_ratio, float(np.nanmean(fields["rise_scale_u"].values[surface.cells]))
     return SurfacePart(
         name=surface.name.removeprefix("region "),
@@ -613,7 +614,7 @@ def _describe_surface(
     )
 
 
-def _edge_notices(edge: NDArray[np.bool_], regions: list[EmissivityRegion]) -> Iterator[Notice]:
+def _edge_notices(edge: NDArray[np.bool_], regions: list[total_uncertainty.EmissivityRegion]) -> Iterator[Notice]:
     """Return a notice for the cells that see two surfaces."""
     if regions:
         named = ", ".join(region.outline.name for region in regions)

@@ -11,18 +11,8 @@ import numpy as np
 import rich.table
 import xarray as xr
 
+from fusion.analysis import levels
 from fusion.analysis.alignment.sensor_health import describe_fault
-from fusion.analysis.levels import (
-    ATTRIBUTION_LEVEL,
-    CAUSE_LEVELS,
-    CHECKS,
-    ENTRY_LEVEL,
-    POSITION_LEVEL,
-    RECORD_ENTRY_LEVEL,
-    REMAINDER_LEVEL,
-    SEARCH_LEVEL,
-    SECOND_LEVEL,
-)
 from fusion.report.findings import Tile, findings, first_screen, headline, next_steps, sharpen
 from fusion.report.letterhead import translation
 from fusion.report.wording import (
@@ -156,7 +146,7 @@ def describe_correlation(
         "warm_up_share": float(maps["warm_up_share"]),
         "courses": int(maps.children["clusters"]["cluster"].max()),
         "condition": float(maps.children["clusters"]["condition"]),
-        "level": ATTRIBUTION_LEVEL,
+        "level": levels.ATTRIBUTION_LEVEL,
         "camera": _camera_prediction(maps.children["sensors"].to_dataset()),
         "sensors": [
             (added, losses[at] > min(losses[:at], default=np.inf)) for at, added in enumerate(correlation.sensors.sets)
@@ -166,7 +156,7 @@ def describe_correlation(
 
 def passes(p: float | None) -> bool:
     """Return whether a family-wise p-value is significant."""
-    return p is not None and p <= ATTRIBUTION_LEVEL
+    return p is not None and p <= levels.ATTRIBUTION_LEVEL
 
 
 class _OtherMode(NamedTuple):
@@ -241,7 +231,7 @@ def _region_targets(maps: xr.DataTree) -> list[tuple[str, list[str], int]]:
     """Return the regions that single targets follow: name, those targets, and the number of targets tested."""
     p = maps.children["target_regions"].to_dataset()["p_value"]
     passed = {
-        str(region): p["series"].values[(p.sel(region=region) <= ATTRIBUTION_LEVEL).values]
+        str(region): p["series"].values[(p.sel(region=region) <= levels.ATTRIBUTION_LEVEL).values]
         for region in p["region"].values
     }
     return [(region, [*map(str, names)], p.sizes["series"]) for region, names in passed.items() if names.size]
@@ -637,10 +627,6 @@ SECTIONS = (
     Section("provenance", "Provenance", "provenance.j2"),
 )  # fmt: skip
 _SIGNS = {"positive": "+", "negative": "−"}
-_LEVELS = {
-    "search": SEARCH_LEVEL, "second": SECOND_LEVEL, "entry": ENTRY_LEVEL, "remainder": REMAINDER_LEVEL, "attribution": ATTRIBUTION_LEVEL,
-    "record_entry": RECORD_ENTRY_LEVEL, "position": POSITION_LEVEL, **CAUSE_LEVELS,
-}  # fmt: skip
 #: Largest number of channels of a record with charts; all of them are in fusion.nc.
 _MOST_CHANNELS = 6
 _ERRORS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
@@ -716,7 +702,7 @@ def describe_campaign(
         if isinstance(results.loop, AxisLoop)
         else None,
         "decided_before": DECIDED_BEFORE,
-        "levels": _LEVELS,
+        "levels": levels,
     }
     return {**facts, "sections": [one for one in SECTIONS if not one.there or facts[one.there] is not None]}
 
@@ -854,7 +840,7 @@ def _comparison_table(deviations: xr.Dataset) -> Table:
 
 def rate_text(rate: float) -> str:
     """Return a measured rate of false alarms in per cent with its expanded uncertainty (k = 2)."""
-    u = np.sqrt(max(rate, 1.0 / CHECKS) * (1.0 - rate) / CHECKS)
+    u = np.sqrt(max(rate, 1.0 / levels.CHECKS) * (1.0 - rate) / levels.CHECKS)
     return f"{100 * rate:.1f} ± {200 * u:.1f} %"
 
 

@@ -17,32 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Literal
 from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError
 
 from fusion.common import FusionError
-from fusion.results.axis import (
-    AlignmentPart,
-    AnomalyPart,
-    CameraPart,
-    CorrelationPart,
-    DriftPart,
-    HotspotPart,
-    Iso230Part,
-    NeighboursPart,
-    RegistrationPart,
-)
+from fusion.results import axis, parts
 from fusion.results.loop import AxisLoop, RecordLoop
 from fusion.results.numbers import measured, p_words, print_unit
-from fusion.results.parts import (
-    ContactSensorPart,
-    FieldPart,
-    InputsPart,
-    Number,
-    PluginPart,
-    RadiometryPart,
-    ResultPart,
-    TemperatureRegionPart,
-    ThermalTest,
-    ThermogramsPart,
-    TimePart,
-)
 from fusion.results.store import Product, plain, require_own
 from thermofuse.resources import vocabulary
 
@@ -88,7 +65,9 @@ class Notice:
     code: Annotated[str, Field(description="Short name, for programs.")]
     message: Annotated[str, Field(description="One sentence with counts and names, for people.")]
     remedy: Annotated[str, Field(description="What would remove the warning; empty where nothing has to be done.")]
-    effect_um: Annotated[Number, Field(description="Size of the effect on the drift, um; null where not known.")] = None
+    effect_um: Annotated[
+        parts.Number, Field(description="Size of the effect on the drift, um; null where not known.")
+    ] = None
 
     @classmethod
     def of(cls, words: str, *, code: str = "", effect_um: float | None = None, **facts: object) -> Notice:
@@ -100,11 +79,11 @@ class Notice:
 
 def _loop_tag(loop: Any) -> str:
     """Return which loop a value is, so that a fault is reported against that one model: only a record has channels."""
-    keys = loop if isinstance(loop, Mapping) else type(loop).model_fields if isinstance(loop, ResultPart) else ()
+    keys = loop if isinstance(loop, Mapping) else type(loop).model_fields if isinstance(loop, parts.ResultPart) else ()
     return "record" if "channels" in keys else "axis"
 
 
-class _Heading(ResultPart):
+class _Heading(parts.ResultPart):
     """What every results.json begins with."""
 
     schema_version: Literal[4] = Field(alias="schema")
@@ -115,46 +94,46 @@ class _Heading(ResultPart):
     """Everything that was left out, is doubtful, or was not possible."""
 
 
-class Parts(ResultPart):
+class Parts(parts.ResultPart):
     """What the stages of a run find, set one after the other; a part that a campaign does not have is never set."""
 
     model_config = ConfigDict(frozen=False)
 
-    plugins: tuple[PluginPart, ...] = ()
+    plugins: tuple[parts.PluginPart, ...] = ()
     """Effects of other distributions that took part in the run."""
-    inputs: InputsPart | None = None
+    inputs: parts.InputsPart | None = None
     """Consistency of the inputs."""
-    time: TimePart | None = None
+    time: parts.TimePart | None = None
     """When the readings were taken; absent where the campaign states no time of day."""
-    thermograms: ThermogramsPart | None = None
+    thermograms: parts.ThermogramsPart | None = None
     """Pictures of a camera that measures alone."""
-    regions: tuple[TemperatureRegionPart, ...] | None = None
+    regions: tuple[parts.TemperatureRegionPart, ...] | None = None
     """Temperatures of the whole picture and of regions in it, by camera; beside a laser only where regions are stated or stored."""
-    registration: RegistrationPart | None = None
+    registration: axis.RegistrationPart | None = None
     """Registration of the thermograms to the plan."""
-    camera: CameraPart | None = None
+    camera: axis.CameraPart | None = None
     """The thermal camera: damaged frames and corrections."""
-    radiometry: RadiometryPart | None = None
+    radiometry: parts.RadiometryPart | None = None
     """Uncertainty of temperatures and rises."""
-    field: FieldPart | None = None
+    field: parts.FieldPart | None = None
     """The temperature fields in short."""
-    sensors: tuple[ContactSensorPart, ...] | None = None
+    sensors: tuple[parts.ContactSensorPart, ...] | None = None
     """Contact sensors on the table."""
-    alignment: AlignmentPart | None = None
+    alignment: axis.AlignmentPart | None = None
     """Both instruments on one clock."""
-    iso230: Iso230Part | None = None
+    iso230: axis.Iso230Part | None = None
     """Axis values by ISO 230-2."""
-    iso230_3: tuple[ThermalTest, ...] | None = None
+    iso230_3: tuple[parts.ThermalTest, ...] | None = None
     """Distortion by temperature, by ISO 230-3: of every run of a record, or of a linear axis."""
-    neighbours: NeighboursPart | None = None
+    neighbours: axis.NeighboursPart | None = None
     """Neighbour differences."""
-    drift: DriftPart | None = None
+    drift: axis.DriftPart | None = None
     """Joint estimate of profile and drift."""
-    anomalies: tuple[AnomalyPart, ...] | None = None
+    anomalies: tuple[axis.AnomalyPart, ...] | None = None
     """Targets that stand out."""
-    hotspots: tuple[HotspotPart, ...] | None = None
+    hotspots: tuple[axis.HotspotPart, ...] | None = None
     """Places that warm more than their surroundings."""
-    correlation: CorrelationPart | None = None
+    correlation: axis.CorrelationPart | None = None
     """Attribution of the drift to parts of the field."""
     loop: (
         Annotated[Annotated[AxisLoop, Tag("axis")] | Annotated[RecordLoop, Tag("record")], Discriminator(_loop_tag)]

@@ -11,21 +11,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.analysis.comparison import ComparedCampaign, PairComparison, common_to_all, contributions
-from fusion.report.charts.style import (
-    CATEGORIES,
-    Chart,
-    Courses,
-    add_band,
-    add_label,
-    add_series,
-    draw,
-    fix_range,
-    new_figure,
-    of_rank,
-    shade,
-    shared_range,
-    span_words,
-)
+from fusion.report.charts import style
 from fusion.results.numbers import number, print_unit
 from interferometry.drift.estimate import scatter_limits
 from interferometry.plots import ACCENT, INK
@@ -39,7 +25,7 @@ _RING: dict[str, Any] = {"marker": "circle", "size": 17, "fill_color": None, "li
 _Values = Callable[[xr.Dataset], tuple[np.ndarray, np.ndarray]]
 
 
-def plot_profiles(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -> Chart | None:
+def plot_profiles(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -> style.Chart | None:
     """Draw the profiles of all campaigns, mean of the approaches, each about its mean, with their 95 % bands."""
 
     def profile(drift: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -50,7 +36,7 @@ def plot_profiles(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -
     return _plot_campaigns(campaigns, names, profile, "deviation about its mean", seen, line=True)
 
 
-def plot_scatters(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -> Chart | None:
+def plot_scatters(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -> style.Chart | None:
     """Draw the scatter at every position of all campaigns."""
 
     def scatter(drift: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -69,21 +55,21 @@ def _plot_campaigns(
     seen: str,
     *,
     line: bool,
-) -> Chart | None:
+) -> style.Chart | None:
     """Draw one quantity of every campaign with readings over position: as lines with bands about zero, or as points from zero."""
     columns = 2 if len(names) <= 6 else 3
     height = 300 + math.ceil(len(names) / columns) * _LEGEND_LINE_PX
-    drawn = new_figure(x="position / mm", y=f"{quantity} / µm", height=height, legend_columns=columns, zero=line)
-    courses = Courses(drawn)
+    drawn = style.new_figure(x="position / mm", y=f"{quantity} / µm", height=height, legend_columns=columns, zero=line)
+    courses = style.Courses(drawn)
     for k, (campaign, name) in enumerate(zip(campaigns, names, strict=True)):
         if campaign.drift is None:
             continue
         drift = campaign.drift.sortby("position")
         x = drift["position"].values.astype(float)
         value, half = values(drift)
-        looks = of_rank(k)
+        looks = style.of_rank(k)
         if line:
-            add_band(drawn, x, value - half, value + half, looks["colour"])
+            style.add_band(drawn, x, value - half, value + half, looks["colour"])
         courses.columns[f"position, {name} / mm"] = x
         heading, marker = f"{quantity.split()[0]}, {name} / µm", _MARKS[k % len(_MARKS)]
         courses.add(x, value, name, column=heading, half=half, marker=marker, line=line, **looks)
@@ -94,28 +80,28 @@ def _plot_campaigns(
     return courses.chart(seen)
 
 
-def plot_remaining(pair: PairComparison) -> Chart | None:
+def plot_remaining(pair: PairComparison) -> style.Chart | None:
     """Draw the difference of two profiles beyond offset, slope and bow with its 95 % interval; what changed is ringed or shaded."""
     if pair.profile is None:
         return None
     x, value, half = pair.profile.position_mm, pair.profile.remaining_um, 2 * pair.profile.remaining_u_um
-    drawn = new_figure(x="position / mm", y="difference / µm", zero=True)
-    style: dict[str, Any] = {"colour": CATEGORIES[0], "line": False, "marker": "circle", "legend": False}
-    add_series(drawn, x, value, name="after − before", half=half, **style)
+    drawn = style.new_figure(x="position / mm", y="difference / µm", zero=True)
+    looks: dict[str, Any] = {"colour": style.CATEGORIES[0], "line": False, "marker": "circle", "legend": False}
+    style.add_series(drawn, x, value, name="after − before", half=half, **looks)
     changed = [change for change in pair.changes if change.group == "profile" and change.significant]
     places = sorted({one.position_mm for one in changed if one.position_mm is not None and one.quantity not in _RUNS})
     at = np.isin(x, places)
     if at.any():
-        draw(drawn, "Scatter", x=x[at], y=value[at], **_RING)
+        style.draw(drawn, "Scatter", x=x[at], y=value[at], **_RING)
     told = [f"{place:g} mm" for place in places]
     for one in changed:
         if one.quantity in _RUNS:
             assert one.position_mm is not None
-            shade(drawn, one.position_mm, one.until_mm, 0.08)
+            style.shade(drawn, one.position_mm, one.until_mm, 0.08)
             told.append(f"from {one.position_mm:g} mm " + ("on" if one.until_mm is None else f"to {one.until_mm:g} mm"))
     marked = f"changed: {', '.join(told)}" if told else "no position changed"
-    seen = f"Difference of the profiles beyond offset, slope and bow: {span_words(value, 'µm')}; {marked}."
-    return Chart(drawn, seen, {"position / mm": x, "difference / µm": value, "95 % interval ± / µm": half})
+    seen = f"Difference of the profiles beyond offset, slope and bow: {style.span_words(value, 'µm')}; {marked}."
+    return style.Chart(drawn, seen, {"position / mm": x, "difference / µm": value, "95 % interval ± / µm": half})
 
 
 #: Changes of the profile over several positions.
@@ -180,32 +166,34 @@ def follow(
     return Trend(name, unit, dates[known][order], value, half, control_limits(value[:-1]), tolerance)
 
 
-def draw_trend(trend: Trend) -> Chart:
+def draw_trend(trend: Trend) -> style.Chart:
     """Draw a quantity over dates with its error bars, its control limits and its tolerance; values outside the limits are ringed."""
     name, unit, when, value, half, limits = trend.name, trend.unit, trend.when, trend.value, trend.half, trend.limits
-    drawn = new_figure(x="date", y=f"{name} / {unit}", x_type="datetime", height=240)
-    add_series(drawn, when, value, name=name, colour=CATEGORIES[0], marker="circle", half=half, legend=False)
-    seen = f"{name} of {value.size} tests: {span_words(value, unit)}"
+    drawn = style.new_figure(x="date", y=f"{name} / {unit}", x_type="datetime", height=240)
+    style.add_series(
+        drawn, when, value, name=name, colour=style.CATEGORIES[0], marker="circle", half=half, legend=False
+    )
+    seen = f"{name} of {value.size} tests: {style.span_words(value, unit)}"
     drawn_um = [value - half, value + half]
     if limits is None:
         seen += f"; control limits need {_LEAST_FOR_LIMITS + 1} tests"
     else:
         for level, dash in zip(limits, ("dashed", "solid", "dashed"), strict=True):
-            draw(drawn, "HSpan", y=level, line_color=ACCENT, line_dash=dash, line_width=1.3)
+            style.draw(drawn, "HSpan", y=level, line_color=ACCENT, line_dash=dash, line_width=1.3)
         drawn_um.append(np.array(limits))
         at = trend.outside
         if at.any():
-            draw(drawn, "Scatter", x=when[at], y=value[at], **_RING)
+            style.draw(drawn, "Scatter", x=when[at], y=value[at], **_RING)
         low, high = number(limits.low, 3), number(limits.high, 3)
         seen += f"; control limits {low} to {high} {unit}, {int(at.sum())} of {value.size} outside"
     if trend.tolerance is not None:
-        draw(drawn, "HSpan", y=trend.tolerance, line_color=INK, line_dash="dotted", line_width=1.6)
-        add_label(drawn, when[0], trend.tolerance, "tolerance", offset=(0, 3), size="11px")
+        style.draw(drawn, "HSpan", y=trend.tolerance, line_color=INK, line_dash="dotted", line_width=1.6)
+        style.add_label(drawn, when[0], trend.tolerance, "tolerance", offset=(0, 3), size="11px")
         drawn_um.append(np.array([trend.tolerance]))
         seen += f"; tolerance {trend.tolerance:g} {unit}"
-    fix_range(drawn, *shared_range(*drawn_um))
+    style.fix_range(drawn, *style.shared_range(*drawn_um))
     columns = {"date": np.datetime_as_string(when, "D"), f"{name} / {unit}": value, f"± (k = 2) / {unit}": half}
-    return Chart(drawn, f"{seen}.", columns)
+    return style.Chart(drawn, f"{seen}.", columns)
 
 
 def follow_trends(pairs: Sequence[PairComparison]) -> list[Trend]:
@@ -233,21 +221,21 @@ def follow_trends(pairs: Sequence[PairComparison]) -> list[Trend]:
 # A fleet: what the tests of one axis of one machine found over their dates.
 
 
-def plot_history(dates: np.ndarray, found: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Chart:
+def plot_history(dates: np.ndarray, found: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> style.Chart:
     """Draw quantities over the dates of tests with their expanded uncertainties, and from eight tests on their control limits.
 
     Each is values and standard uncertainties, um, by its symbol.
     """
     order = np.argsort(dates, kind="stable")
-    drawn = new_figure(x="date", y=f"{', '.join(found)} / µm", x_type="datetime", height=240)
-    courses = Courses(drawn, {"date": np.datetime_as_string(dates[order], "D")})
-    for (name, (values, u)), colour, marker in zip(found.items(), CATEGORIES, _MARKS, strict=False):
+    drawn = style.new_figure(x="date", y=f"{', '.join(found)} / µm", x_type="datetime", height=240)
+    courses = style.Courses(drawn, {"date": np.datetime_as_string(dates[order], "D")})
+    for (name, (values, u)), colour, marker in zip(found.items(), style.CATEGORIES, _MARKS, strict=False):
         value, half = values[order], 2 * np.nan_to_num(u[order])
         limits = control_limits(value[np.isfinite(value)])
-        told = span_words(value, "µm")
+        told = style.span_words(value, "µm")
         if limits is not None:
             for level, dash in zip(limits, ("dashed", "dotted", "dashed"), strict=True):
-                draw(drawn, "HSpan", y=level, line_color=colour, line_dash=dash, line_width=1.1)
+                style.draw(drawn, "HSpan", y=level, line_color=colour, line_dash=dash, line_width=1.1)
             beyond = int(((value < limits.low) | (value > limits.high)).sum())
             told += f", control limits {number(limits.low)} to {number(limits.high)} µm, {beyond} outside"
         looks = {"half": half, "colour": colour, "marker": marker}

@@ -24,27 +24,7 @@ from fusion.analysis.drift_model.recursion import make_recursion
 from fusion.analysis.predicted_test import in_order, predict_values, scatter_and_drift
 from fusion.common import Array
 from fusion.common.messages import naming
-from fusion.report.exports import tables
-from fusion.report.exports.controls import (
-    CONTROLS,
-    MODELS,
-    Control,
-    ErrorTable,
-    ExportError,
-    Origin,
-    Profile,
-    emit,
-    fit_temperature_line,
-    header_lines,
-    objections_to_model,
-    path_variance,
-    read_active,
-    read_origin,
-    read_profile,
-    read_thermal_state,
-    siemens_temperature,
-    tabulate,
-)
+from fusion.report.exports import controls, tables
 from fusion.report.wording import sentences
 from fusion.results.axis import AnomalyPart, HotspotPart
 from fusion.results.loop import RecordLoop
@@ -78,7 +58,7 @@ def _moves(anomaly: AnomalyPart) -> bool:
 # What a compensation table is predicted to do.
 
 
-def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> dict[str, float]:
+def predict(profile: controls.Profile, table: controls.ErrorTable, *, one_table: bool) -> dict[str, float]:
     """Return what the header says of a control that interpolates linearly between the points of a table, free of drift, um.
 
     E of ISO 230-2 without the table (`before_um`), what it leaves of its own profile (`own_um`), the largest departure of its lines
@@ -94,8 +74,8 @@ def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> dict[str
 
 
 def predict_test(
-    profile: Profile,
-    table: ErrorTable,
+    profile: controls.Profile,
+    table: controls.ErrorTable,
     scatter_um: Array,
     drift_um: Array,
     freedom: float = np.inf,
@@ -111,7 +91,7 @@ def predict_test(
     )
 
 
-def remainder_um(profile: Profile, table: ErrorTable, *, one_table: bool) -> Array:
+def remainder_um(profile: controls.Profile, table: controls.ErrorTable, *, one_table: bool) -> Array:
     """Return what a table leaves of a profile at the targets (2, n), up to a constant."""
     return profile.deviation_um - table.added_um(profile.position_mm, one_table=one_table)
 
@@ -119,7 +99,7 @@ def remainder_um(profile: Profile, table: ErrorTable, *, one_table: bool) -> Arr
 #: Setting data that follow a temperature.
 TEMPERATURE_FORMAT = "siemens840d-temperature"
 _PICTURES = ("png", "gif", "mp4")
-FORMATS = ("csv", "xlsx", *_PICTURES, *CONTROLS, TEMPERATURE_FORMAT, *MODELS)
+FORMATS = ("csv", "xlsx", *_PICTURES, *controls.CONTROLS, TEMPERATURE_FORMAT, *controls.MODELS)
 _NO_LASER = "this campaign has no laser, so there is neither drift nor profile to write; --format csv and xlsx write its temperatures"
 #: Name of an axis that every control accepts.
 _AXIS = re.compile(r"[A-Za-z][A-Za-z0-9]{0,9}")
@@ -213,13 +193,13 @@ def export_results(
     >>> export_results("results", "csv", "results/export")  # doctest: +SKIP
     """
     if format not in FORMATS:
-        raise ExportError(f'there is no format "{format}"; write one of {", ".join(FORMATS)}')
+        raise controls.ExportError(f'there is no format "{format}"; write one of {", ".join(FORMATS)}')
     folder, found = Path(results), read_results(Path(results))
-    if format in MODELS:
+    if format in controls.MODELS:
         content, notes = _model_text(folder, found, format, sampling_s=sampling_s, reduced=reduced, force=force)
     elif format in _PICTURES:
         if not (folder / "fields.nc").is_file():
-            raise ExportError(f"{folder}: {_NO_PLAN}")
+            raise controls.ExportError(f"{folder}: {_NO_PLAN}")
         content = draw_maps(read_product(folder, "fields"), found.hotspots or (), found.campaign, format)
         notes = []
     elif not (folder / "deviations.nc").is_file():
@@ -240,7 +220,7 @@ def export_results(
             texts, notes = (
                 _temperature_text(run, axis, reference_mm, force=force)
                 if format == TEMPERATURE_FORMAT
-                else _table_texts(run, CONTROLS[format], axis, spacing_mm, reference_mm, active, force=force)
+                else _table_texts(run, controls.CONTROLS[format], axis, spacing_mm, reference_mm, active, force=force)
             )
         content = {name: partial(Path.write_text, data=text, encoding="ascii") for name, text in texts.items()}
     return Exported(_write(Path(out), content, overwrite=overwrite), tuple(notes))
@@ -253,23 +233,28 @@ class _Run:
     folder: Path
     results: Results
     deviations: xr.Dataset
-    origin: Origin
+    origin: controls.Origin
 
 
 def _read_run(folder: Path, results: Results) -> _Run:
     """Read the run that the table of a control is made from."""
     deviations = read_product(folder, "deviations")
     if not has(deviations, "estimate"):
-        raise ExportError(
+        raise controls.ExportError(
             f"{folder}: the readings have no times, or are too few, so there is neither drift nor profile to write; --format csv and xlsx "
             "give the values by ISO 230-2"
         )
-    return _Run(folder, results, deviations, read_origin(folder, results, read_thermal_state(folder, deviations)))
+    return _Run(
+        folder,
+        results,
+        deviations,
+        controls.read_origin(folder, results, controls.read_thermal_state(folder, deviations)),
+    )
 
 
 def _table_texts(
     run: _Run,
-    control: Control,
+    control: controls.Control,
     axis: str | None,
     spacing_mm: float | None,
     reference_mm: float | None,
@@ -278,17 +263,17 @@ def _table_texts(
     force: bool,
 ) -> tuple[dict[str, str], list[str]]:
     """Return the files of a control's table by name, and what to tell the user."""
-    active, unknown = read_active(run.folder, control, run.origin, given)
+    active, unknown = controls.read_active(run.folder, control, run.origin, given)
     against = _judge([*objections(run.results), *unknown], force=force)
-    profile = read_profile(run.deviations)
-    table = tabulate(profile, spacing_mm=spacing_mm, reference_mm=reference_mm, active=active)
+    profile = controls.read_profile(run.deviations)
+    table = controls.tabulate(profile, spacing_mm=spacing_mm, reference_mm=reference_mm, active=active)
     if control.most_points is not None and table.position_mm.size > control.most_points:
-        raise ExportError(
+        raise controls.ExportError(
             f"{table.position_mm.size} points; {control.words} reads at most {control.most_points}, choose a wider --spacing"
         )
     if control.equal_spacing and table.spacing_mm() is None:
         distances = sorted({round(float(step), 4) for step in table.position_mm[1:] - table.position_mm[:-1]})
-        raise ExportError(
+        raise controls.ExportError(
             f"{control.words}: needs equally spaced points; these are {distances[0]:g} to {distances[-1]:g} mm apart, as ISO 230-2 asks "
             f'for: resample them, for example with --spacing "{distances[len(distances) // 2]:.0f} mm"'
         )
@@ -299,8 +284,8 @@ def _table_texts(
     facts["prediction"] = predict(profile, table, one_table=control.one_table)
     facts["tested"] = tested = _predict_test(run, profile, table, control, file)
     facts["with_table"] = run.results.iso230.with_table if run.results.iso230 else None
-    facts["between_um"] = (path_variance(profile) * table.widest_gap_mm / 4.0) ** 0.5
-    header = header_lines(run.origin, **facts, objections=against, remarks=remarks(run.results))
+    facts["between_um"] = (controls.path_variance(profile) * table.widest_gap_mm / 4.0) ** 0.5
+    header = controls.header_lines(run.origin, **facts, objections=against, remarks=remarks(run.results))
     texts = {file: control.write(table, name, header if control.comment else ())}
     texts[f"{file}{PREDICTION_ENDING}"] = json.dumps(tested.model_dump(mode="json"), indent=2) + "\n"
     if not control.comment:
@@ -311,7 +296,9 @@ def _table_texts(
     return texts, [*_forced(against), *remarks(run.results), *missing]
 
 
-def _predict_test(run: _Run, profile: Profile, table: ErrorTable, control: Control, file: str) -> TablePrediction:
+def _predict_test(
+    run: _Run, profile: controls.Profile, table: controls.ErrorTable, control: controls.Control, file: str
+) -> TablePrediction:
     """Return what a test with the table is predicted to show, for ``thermofuse compare --applied``."""
     iso = run.results.iso230
     cycles = len(iso.cycles) if iso is not None and iso.cycles else STANDARD_CYCLES
@@ -341,19 +328,19 @@ def _temperature_text(
     there = (run.folder / "fusion.nc").is_file()
     material = read_product(run.folder, "fusion").get("material_temperature") if there else None
     if material is None:
-        raise ExportError(
+        raise controls.ExportError(
             f"{run.folder}: no material temperature was logged; a temperature line needs one ([interferometry] environment)"
         )
     targets = run.deviations["position"].values
     reference = float(np.clip(0.0, targets.min(), targets.max())) if reference_mm is None else reference_mm
-    line = fit_temperature_line(run.deviations, material, reference_mm=reference)
+    line = controls.fit_temperature_line(run.deviations, material, reference_mm=reference)
     against = _judge([*objections(run.results), *line.objections()], force=force)
     name = _axis_name(run, axis, needed=True)
     words = "Siemens SINUMERIK 840D, temperature compensation (SD43900, SD43910, SD43920)"
     sign = "the compensation value K0(T) + tan beta(T) (P - P0) is the measured error line: measured minus programmed"
     facts = {"words": words, "axis": name, "line": line, "sign": sign}
-    header = header_lines(run.origin, **facts, objections=against, remarks=())
-    return {f"temperature_{name}.MPF": siemens_temperature(line, name, header)}, _forced(against)
+    header = controls.header_lines(run.origin, **facts, objections=against, remarks=())
+    return {f"temperature_{name}.MPF": controls.siemens_temperature(line, name, header)}, _forced(against)
 
 
 def _model_text(
@@ -362,17 +349,17 @@ def _model_text(
     """Return the file of a record's drift model for a control, and what to tell the user."""
     if not isinstance(results.loop, RecordLoop):
         if not (folder / "deviations.nc").is_file():
-            raise ExportError(f"{folder}: {_NO_LASER}")
-        raise ExportError(
+            raise controls.ExportError(f"{folder}: {_NO_LASER}")
+        raise controls.ExportError(
             f"{folder}: a drift model is written from a test with temperature sensors ([record]); that of an axis follows a camera, which "
             "does not stay at the machine: export a compensation table, or siemens840d-temperature"
         )
     if not 0.0 < sampling_s <= 60.0:
-        raise ExportError(
+        raise controls.ExportError(
             f"--sampling {sampling_s:g} s does not suit a thermal state; write a time above 0 and up to 60 s"
         )
     product = read_product(folder, "record")
-    constant, against = product.attrs.get("constant_drivers"), objections_to_model(results)
+    constant, against = product.attrs.get("constant_drivers"), controls.objections_to_model(results)
     if constant and not product.sizes["driver_name"]:
         against.append(f"nothing shows how the machine responds to what never changed in the test: {constant}")
     against = _forced(_judge(against, force=force))
@@ -386,7 +373,7 @@ def _model_text(
             reduced=reduced,
             remarks=against,
         )
-        file, text = emit(model, format)
+        file, text = controls.emit(model, format)
     curve = [
         f"{len(one.sensors)} of {len(model.sensor_curve[0].sensors)} sensors: {one.cross_rmse:.3g} um by cross-validation, "
         f"{one.held_out_rmse:.3g} um on the hold-out set ({', '.join(one.sensors) or 'none'})"
@@ -398,7 +385,7 @@ def _model_text(
 def _judge(against: list[str], *, force: bool) -> list[str]:
     """Return the objections of an export that is forced; refuse one that is not."""
     if against and not force:
-        raise ExportError(
+        raise controls.ExportError(
             f"no compensation is written: {'; '.join(against)}. Remove the cause and run again, or add --force: the reason "
             "is then written into it"
         )
@@ -417,14 +404,14 @@ def _axis_name(run: _Run, given: str | None, *, needed: bool) -> str:
     if given is None and not needed:
         return ""
     why = f'"{stated}" is no name of an axis' if stated else "the campaign does not state the axis"
-    raise ExportError(f"{why}; write a letter and up to nine letters or digits, for example --axis X1")
+    raise controls.ExportError(f"{why}; write a letter and up to nine letters or digits, for example --axis X1")
 
 
 def _tables_without_laser(folder: Path, results: Results, format: str) -> dict[str, pd.DataFrame]:
     """Return the tables by title that a record has, or a campaign of the camera alone; nothing of it is the table of a control."""
     record = isinstance(results.loop, RecordLoop)
     if format not in ("csv", "xlsx"):
-        raise ExportError(
+        raise controls.ExportError(
             f"{folder}: a record of displacements has no target positions, so there is no profile to write; --format csv and xlsx write "
             f"its tables, model-json, model-c, model-st and model-linuxcnc its drift for a control"
             if record
@@ -435,7 +422,9 @@ def _tables_without_laser(folder: Path, results: Results, format: str) -> dict[s
     if (folder / "fields.nc").is_file() and format == "csv":
         return {"fields": tables.fields_table(folder)}
     if not (frames := tables.camera_tables(results, folder)):
-        raise ExportError(f"{folder}: it holds results.json alone, no product to write; run the campaign again")
+        raise controls.ExportError(
+            f"{folder}: it holds results.json alone, no product to write; run the campaign again"
+        )
     return frames
 
 
@@ -459,7 +448,7 @@ def _csv_tables(
     }
     if with_fields:
         if not (folder / "fields.nc").is_file():
-            raise ExportError(
+            raise controls.ExportError(
                 f"{folder}: there is no fields.nc in it, so that no fields.csv can be written; leave --fields out"
             )
         frames["fields"] = tables.fields_table(folder)
@@ -469,11 +458,11 @@ def _csv_tables(
 def _write(out: Path, content: dict[str, Writer], *, overwrite: bool) -> tuple[Path, ...]:
     """Write files, or none where one of them exists and may not be replaced."""
     if out.exists() and not out.is_dir():
-        raise ExportError(f"{out} is a file; name a folder with --out")
+        raise controls.ExportError(f"{out} is a file; name a folder with --out")
     paths = {out / name: write for name, write in content.items()}
     there = [path.name for path in paths if path.exists()]
     if there and not overwrite:
-        raise ExportError(
+        raise controls.ExportError(
             f"{out}: {', '.join(there)} exists already; add --overwrite to replace it, or name another folder with --out"
         )
     return tuple(write_atomically(path, write) for path, write in paths.items())

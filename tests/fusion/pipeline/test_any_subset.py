@@ -12,7 +12,8 @@ from fusion.analysis.alignment.align import AlignmentError
 from fusion.pipeline.check import check_campaign
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.run import run_campaign
-from fusion.report.exports.export import ExportError, export_results
+from fusion.report.exports.controls import ExportError
+from fusion.report.exports.export import export_results
 from fusion.report.findings import summary_rows
 from fusion.report.fleet import Row, with_findings
 from fusion.report.page import report_of

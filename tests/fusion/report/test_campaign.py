@@ -13,7 +13,8 @@ from fusion.report.campaign import describe_campaign, describe_correlation, rate
 from fusion.report.charts.embedded import MapControls
 from fusion.report.page import render_page
 from fusion.report.wording import environment, region_words, table
-from fusion.results.results import AxisLoop, CorrelationPart, Results, assemble, read_results
+from fusion.results.axis import CorrelationPart
+from fusion.results.results import AxisLoop, Results, assemble, read_results
 from fusion.results.store import group, read_grouped, read_tree
 from tests.fusion.report.page_tables import tables_of
 from tests.fusion.results_sample import PARTS

@@ -12,7 +12,15 @@ from fusion.report.campaign import describe_model
 from fusion.report.findings import action, next_steps, step_phrase
 from fusion.report.wording import effect_words, say
 from fusion.results import numbers
-from fusion.results.axis import DutyPart, Evidence, Iso230WithTable, SourcePart
+from fusion.results.axis import (
+    AnomalyPart,
+    CorrelationPart,
+    DutyPart,
+    Evidence,
+    Iso230Part,
+    Iso230WithTable,
+    SourcePart,
+)
 from fusion.results.loop import (
     AxisStep,
     AxisUnexplained,
@@ -29,7 +37,7 @@ from fusion.results.loop import (
     Unexplained,
 )
 from fusion.results.parts import AreaPart, InputsPart, Iso230Tolerance, Quantity, TimePart
-from fusion.results.results import AnomalyPart, CorrelationPart, Iso230Part, Notice, RecordLoop, Results, assemble
+from fusion.results.results import Notice, RecordLoop, Results, assemble
 from tests.fusion.results_sample import PARTS, told
 
 

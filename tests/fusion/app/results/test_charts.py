@@ -8,9 +8,8 @@ from bokeh.models import LinearColorMapper, Text
 
 from fusion.app.parts import table
 from fusion.app.results import Place, Products, Selection, ThermalView, position_readings
-from fusion.results.axis import SourcePart
+from fusion.results.axis import CorrelationPart, SourcePart
 from fusion.results.parts import AreaPart
-from fusion.results.results import CorrelationPart
 from tests.fusion.app.texts import texts
 
 

@@ -9,7 +9,7 @@ from zipfile import ZipFile
 import pytest
 
 from fusion.app.results import _put, _write_sheet, _write_thermal_sheet
-from fusion.pipeline.iso230 import StatedTests
+from fusion.pipeline.iso230_3 import StatedTests
 from fusion.report.page import ProductsError
 from fusion.results.parts import ThermalTest
 from fusion.results.store import file_sha256

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.report.exports.export import CyclePictures, ExportError, export_results
+from fusion.report.exports.controls import ExportError
+from fusion.report.exports.export import CyclePictures, export_results
 from fusion.results.axis import HotspotPart
 from tests.fusion.report.exports.small_run import write_fields
 
