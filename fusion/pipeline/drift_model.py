@@ -15,16 +15,7 @@ from fusion.analysis.alignment.readings import Readings, read_fused
 from fusion.analysis.consistency.camera import mean_rise, reflected_share, zero_share
 from fusion.analysis.consistency.model import compare_lines, with_line, withhold_names
 from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
-from fusion.analysis.drift_model.axis import (
-    AxisResult,
-    FieldFault,
-    close_axis,
-    correct_fields,
-    corrected_variables,
-    find_field_errors,
-    on_corrected_fields,
-    set_aside_sites,
-)
+from fusion.analysis.drift_model import axis as axis_loop
 from fusion.analysis.drift_model.model import ModelFit, fit_model
 from fusion.analysis.effects.effect import Effect, Prior
 from fusion.analysis.effects.library import library
@@ -165,7 +156,7 @@ _PREDICTIONS = {"declared": "declared model", "final": "with the added effects",
 class CorrectedCamera:
     """Errors of the camera that the loop found, and both recordings aligned again on fields without them."""
 
-    errors: list[FieldFault]
+    errors: list[axis_loop.FieldFault]
     fused: xr.Dataset
 
 
@@ -175,7 +166,7 @@ def model_drift(
     """Close the loop, then judge the positions that stand out from what the model explains."""
     readings = read_fused(fused)
     effects = library_for(source)
-    result = close_axis(
+    result = axis_loop.close_axis(
         readings,
         source.campaign.declared,
         effects=effects,
@@ -186,7 +177,7 @@ def model_drift(
         corrected = correct_camera(source, result, fields, fused, deviations)
     if corrected is not None:
         names = {error.effect for error in corrected.errors}
-        result = on_corrected_fields(result, read_fused(corrected.fused), names, effects=effects)
+        result = axis_loop.on_corrected_fields(result, read_fused(corrected.fused), names, effects=effects)
     errors = [] if corrected is None else corrected.errors
     models = both_models(result)
     tests = {name: examine_residual(model, np.random.default_rng(1)) for name, model in models.items()}
@@ -195,11 +186,11 @@ def model_drift(
     )
     report("anomalies", 0, 1)
     positions = diagnose_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
-    result = set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
+    result = axis_loop.set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
     report("anomalies", 1, 1)
     anomalies, line = [store.plain(position) for position in positions], None
     if isinstance(source, Source) and fields is not None:
-        line = compare_lines(result.after, len(result.declared), correct_fields(fields, errors), source.axis)
+        line = compare_lines(result.after, len(result.declared), axis_loop.correct_fields(fields, errors), source.axis)
     described = result.described(ResidualTestsPart(**tests), field_corrections=errors, axis_line=line)
     loop = described.model_dump(exclude_unset=True)
     if isinstance(source, Source) and fields is not None:
@@ -219,20 +210,20 @@ def model_drift(
 
 
 def correct_camera(
-    source: Source, result: AxisResult, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset
+    source: Source, result: axis_loop.AxisResult, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset
 ) -> CorrectedCamera | None:
     """Take the camera's errors that entered the model out of the fields, and align both recordings again."""
-    errors = find_field_errors(result, fields, fused)
+    errors = axis_loop.find_field_errors(result, fields, fused)
     if not errors:
         return None
     # Errors of reading that were left out stay out.
     used = deviations.assign(deviation=deviations["deviation"].where(fused["deviation"].notnull()))
-    corrected = correct_fields(fields, errors)
+    corrected = axis_loop.correct_fields(fields, errors)
     aligned = align(used, corrected, source.axis, environment=source.environment, drivers=source.drivers)
     return CorrectedCamera(errors, aligned)
 
 
-def both_models(result: AxisResult) -> dict[str, ModelFit]:
+def both_models(result: axis_loop.AxisResult) -> dict[str, ModelFit]:
     """The declared and the final model, each fitted to all readings."""
     return {"declared": fit_model(result.before.readings, result.before.terms), "final": result.after}
 
@@ -245,7 +236,7 @@ def correction_variables(
         return {}
     names = ("mean_rise", "axis_integral", "local_rise")
     return {
-        **corrected_variables(fields, fused, corrected.errors),
+        **axis_loop.corrected_variables(fields, fused, corrected.errors),
         **{f"{name}_corrected": corrected.fused[name] for name in names},
     }
 
@@ -279,7 +270,7 @@ def library_for(source: Inputs) -> dict[str, Effect]:
     return {**effects, "axis_expansion": replace(effects["axis_expansion"], prior=expected)}
 
 
-def field_notices(errors: Sequence[FieldFault]) -> Iterator[Notice]:
+def field_notices(errors: Sequence[axis_loop.FieldFault]) -> Iterator[Notice]:
     """Notices of camera errors that were taken out of the fields."""
     for one in errors:
         yield Notice.of("field_corrected", code=f"field_corrected_{one.effect}", text=upper_first(one.text))
@@ -329,7 +320,9 @@ def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Map
     return xr.Dataset(variables, coords={"effect": unique, "period": period})
 
 
-def with_event_times(steps: Sequence[Mapping[str, Any]], result: AxisResult, fused: xr.Dataset) -> list[dict[str, Any]]:
+def with_event_times(
+    steps: Sequence[Mapping[str, Any]], result: axis_loop.AxisResult, fused: xr.Dataset
+) -> list[dict[str, Any]]:
     """Entries of ``loop.steps`` with the time of day of every event."""
     start = fused["time"].values[fused["deviation"].notnull().values].min()
     events_s = [term.candidate.event_s for term in result.state.added]
@@ -339,7 +332,7 @@ def with_event_times(steps: Sequence[Mapping[str, Any]], result: AxisResult, fus
     ]
 
 
-def prediction_variables(fused: xr.Dataset, result: AxisResult) -> dict[str, xr.Variable]:
+def prediction_variables(fused: xr.Dataset, result: axis_loop.AxisResult) -> dict[str, xr.Variable]:
     """Lay the errors that the loop reports out by cycle, direction and target: those on the hold-out cycles, and of left-out blocks."""
     held_out = result.before.readings.subset(~result.before.used)
     variables = {

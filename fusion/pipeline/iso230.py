@@ -34,29 +34,19 @@ from fusion.results.parts import Iso230Condition, Iso230Tolerance, Quantity, dec
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results
 from fusion.results.store import file_sha256, group, has, is_file_list, joined, plain, read_json_object, read_product
+from interferometry import iso230 as standard
 from interferometry.common import InterferometryError
 from interferometry.drift.estimate import NoScatterError, estimate_drift
 from interferometry.drift.planning import estimate_settling
 from interferometry.inspection import describe_notes
 from interferometry.io.readings import read_deviations
-from interferometry.iso230 import (
-    CONTRIBUTIONS,
-    QUANTITIES,
-    SAMPLING,
-    STANDARD_CYCLES,
-    Iso230Budget,
-    accuracy_with_table,
-    evaluate_iso230,
-    evaluate_other_standards,
-    evaluate_windows,
-)
 from interferometry.iso230.conditions import check_conditions
 from interferometry.iso230.quantities import LENGTHS
 
-_LAST = f"the last {STANDARD_CYCLES} whole cycles of the test"
+_LAST = f"the last {standard.STANDARD_CYCLES} whole cycles of the test"
 _ONLY = "the only window of the test"
 _CHOSEN = "as chosen"
-_AXIS = (*QUANTITIES, "mean_reversal")
+_AXIS = (*standard.QUANTITIES, "mean_reversal")
 
 
 def estimate_joint(deviations: xr.Dataset) -> tuple[xr.Dataset | None, tuple[Notice, ...]]:
@@ -87,7 +77,7 @@ def evaluate_standard(
         "drift": None if drift is None else drift["drift"],
         "material_degC": material_by_cycle(deviations, environment),
     }
-    windows = evaluate_windows(deviations, **beside)
+    windows = standard.evaluate_windows(deviations, **beside)
     numbers = deviations["cycle"].values
     blocks = [
         numbers[(numbers >= first) & (numbers <= last)].tolist()
@@ -95,7 +85,7 @@ def evaluate_standard(
     ]
     of_standard = _of_standard(windows)
     chosen = blocks[of_standard.sizes["window"] - 1] if cycles is None else cycles
-    first, quoted = (evaluate_iso230(deviations, cycles=window, **beside) for window in (blocks[0], chosen))
+    first, quoted = (standard.evaluate_iso230(deviations, cycles=window, **beside) for window in (blocks[0], chosen))
     rule = _CHOSEN if cycles is not None else _ONLY if of_standard.sizes["window"] == 1 else _LAST
     # What was measured beside the readings tells where two inputs of the budget come from.
     material = beside["material_degC"] is not None
@@ -105,7 +95,8 @@ def evaluate_standard(
         window_rule=rule,
         first=described(first, blocks[0]),
         range_um={
-            name: Iso230Range(lowest=of_standard[name].min(), highest=of_standard[name].max()) for name in QUANTITIES
+            name: Iso230Range(lowest=of_standard[name].min(), highest=of_standard[name].max())
+            for name in standard.QUANTITIES
         },
         with_table=None
         if drift is None
@@ -123,7 +114,7 @@ def _with_table(
     deviations: xr.Dataset, drift: xr.Dataset, windows: list[list[int]], quoted: list[int]
 ) -> Iso230WithTable | None:
     """Return A with a compensation table; None where no cycles are left that it could be made from."""
-    found = accuracy_with_table(deviations, drift["drift"], [quoted, *windows])
+    found = standard.accuracy_with_table(deviations, drift["drift"], [quoted, *windows])
     if not np.isfinite(found).all():
         return None
     return Iso230WithTable(quoted_um=found[0], lowest_um=found.min(), highest_um=found.max())
@@ -142,7 +133,7 @@ def _describe_window(
         direction: {f"{name}_um": _quantity(result, f"{name}_unidirectional", direction=direction) for name in "ARE"}
         for direction in ("positive", "negative")
     }
-    other = [name for name in CONTRIBUTIONS if name not in SAMPLING]
+    other = [name for name in standard.CONTRIBUTIONS if name not in standard.SAMPLING]
     without = (result["contribution"].sel(contributor=other) ** 2).sum("contributor", skipna=False) ** 0.5
     one_way = {
         name: float((found.sel(contributor=other) ** 2).sum() ** 0.5) for name, found in _one_way_shares(result).items()
@@ -157,7 +148,7 @@ def _describe_window(
         u_without_sampling_um={name: without.sel(quantity=name) for name in _AXIS} | one_way,
         contributions=[
             _contribution(result, name, budget, drift, material)
-            for name in CONTRIBUTIONS
+            for name in standard.CONTRIBUTIONS
             if budget.origins.get(name) != "not of a rotary axis"
         ],
     )
@@ -214,7 +205,7 @@ def complete_sheet(
     limits = (AcceptanceTable() if campaign is None else campaign.acceptance).limits()
     settling = estimate_settling(dataset, group(dataset, "estimate")) if has(dataset, "estimate") else None
     checks = check_conditions(dataset, cycles=cycles, lead_mm=report.screw_lead_mm, settling=settling)
-    others = [] if is_rotary(dataset) else evaluate_other_standards(dataset, cycles=cycles)
+    others = [] if is_rotary(dataset) else standard.evaluate_other_standards(dataset, cycles=cycles)
     windows = _of_standard(group(dataset, "iso"))
     judged = [row for symbol, limit in limits.items() for row in _judge(part, windows, symbol, limit)]
     met = {check.met for check in checks}
@@ -399,7 +390,11 @@ def read_test(path: Path, cycles: str | None) -> StandardTest:
         return _evaluate(campaign.campaign.title, named, *read)
     deviations = read_deviations(path, rotary=True)
     window = None if cycles is None else _window_of(cycles, deviations, path.name)
-    budget = ROTARY_BUDGET if is_rotary(deviations) else StatedBudget(Iso230Budget(), dict.fromkeys(LENGTHS, "assumed"))
+    budget = (
+        ROTARY_BUDGET
+        if is_rotary(deviations)
+        else StatedBudget(standard.Iso230Budget(), dict.fromkeys(LENGTHS, "assumed"))
+    )
     try:
         return _evaluate(path.name, {path.name: path}, deviations, budget, window)
     except InterferometryError as error:

@@ -20,30 +20,13 @@ from fusion.campaign.inputs import read_laser, read_record
 from fusion.campaign.schema import keys_of
 from fusion.campaign.time_zones import shown_zone
 from fusion.common import Array
-from fusion.pipeline.iso230 import (
-    date_of,
-    estimate_joint,
-    files_of_run,
-    hashed,
-    sheet_files,
-    sheet_of_run,
-    state_conditions,
-)
+from fusion.pipeline import iso230
 from fusion.report.letterhead import PLAIN, Letterhead
 from fusion.results.parts import Quantity, TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
 from fusion.results.results import read_results
 from fusion.results.store import group, has
 from interferometry.deviations import ROUNDING, resolution
-from interferometry.iso230.thermal import (
-    AVERAGED_S,
-    Distortion,
-    average,
-    axis_courses,
-    evaluate_distortion,
-    scatter,
-    tilt,
-    with_ends,
-)
+from interferometry.iso230 import thermal
 
 #: Standard uncertainty of the sensitivity of a displacement sensor where none is stated: one percent of the reading.
 ASSUMED_CALIBRATION = 0.01
@@ -94,9 +77,9 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
     raw = table["displacement"].values
     # A clock that was set back gives readings of one time.
     between = np.diff(np.unique(elapsed))
-    per_piece = max(1.0, AVERAGED_S / float(np.median(between))) if between.size else 1.0
-    seconds, displacement = with_ends(*average(elapsed, raw), elapsed[-1])
-    temperature = with_ends(*average(elapsed, table["temperature"].values), elapsed[-1])[1]
+    per_piece = max(1.0, thermal.AVERAGED_S / float(np.median(between))) if between.size else 1.0
+    seconds, displacement = thermal.with_ends(*thermal.average(elapsed, raw), elapsed[-1])
+    temperature = thermal.with_ends(*thermal.average(elapsed, table["temperature"].values), elapsed[-1])[1]
     share = (
         (ASSUMED_CALIBRATION, "assumed, 1 % of the reading")
         if stated.sensor_calibration is None
@@ -104,7 +87,7 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
     )
     courses = []
     for k, channel in enumerate(channels):
-        noise = scatter(raw[:, k]) / np.sqrt(per_piece)
+        noise = thermal.scatter(raw[:, k]) / np.sqrt(per_piece)
         digit = ROUNDING * resolution(raw[:, k])
         sources: dict[str, tuple[float | None, str]] = {
             "noise": (noise, "from the second differences of the readings, mean of one minute"),
@@ -125,7 +108,7 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
     sensors = [
         _Course(str(name), "K", course, {"noise": (noise, "")}, (0.0, ""), noise)
         for name, course in zip(table["sensor"].values, temperature.T, strict=True)
-        for noise in [scatter(course)]
+        for noise in [thermal.scatter(course)]
     ]
     return _test(stated.kind or "not stated", name, seconds, courses, sensors, remarks)
 
@@ -154,7 +137,7 @@ def _tilts(courses: Sequence[_Course], stated: ThermalTestTable) -> Iterator[_Co
         }
         # What holds both sensors moves both alike.
         sources["mounting"] = (None, "not known, not contained: only the difference of both sensors' mountings tilts")
-        values = tilt(first.values, second.values, distance_mm=tilted.distance_mm)
+        values = thermal.tilt(first.values, second.values, distance_mm=tilted.distance_mm)
         noise = float(np.hypot(first.noise, second.noise)) * per_um
         yield _Course(f"{name} ({first.name}, {second.name})", "um/m", values, sources, first.share, noise)
 
@@ -167,11 +150,11 @@ def evaluate_axis_test(deviations: xr.Dataset, drift: xr.Dataset | None, stated:
     few = deviations.sizes["cycle"] < 2 or np.unique(deviations["position"].values).size < 2
     if not timed.any() or few or deviations["deviation"].attrs["units"] != "um":
         return []
-    seconds, values, line_u = axis_courses(deviations)
+    seconds, values, line_u = thermal.axis_courses(deviations)
     u = {key: float(np.nanmedian(one)) for key, one in line_u.items()}
     origin = "scatter of all targets about the straight line"
     if drift is not None:
-        _, values, _ = axis_courses(deviations.assign(deviation=drift["drift"]))
+        _, values, _ = thermal.axis_courses(deviations.assign(deviation=drift["drift"]))
         first, last = (
             drift["drift_u"]
             .mean("direction")
@@ -220,7 +203,7 @@ def _test(
 ) -> ThermalTest:
     """Return a test from its courses."""
     every = max(1, -(-seconds.size // _KEPT))
-    ranges = [evaluate_distortion(seconds, one.values) for one in (*courses, *sensors)]
+    ranges = [thermal.evaluate_distortion(seconds, one.values) for one in (*courses, *sensors)]
     excess = [_excess_of_ranges(one, seconds) for one in (*courses, *sensors)]
     found = [*map(_distortion, (*courses, *sensors), ranges, excess)]
     return ThermalTest(
@@ -266,25 +249,26 @@ def _budget(course: _Course, size: float, excess: float) -> list[tuple[str, floa
     return [*sources, ("calibration", share * abs(size), origin)] if origin else sources
 
 
-def _excess_of_ranges(course: _Course, seconds: Array) -> Distortion:
+def _excess_of_ranges(course: _Course, seconds: Array) -> thermal.Distortion:
     """Return by how much noise widens the ranges of a course on average, in its unit (ISO 230-2 has the same row in its budget)."""
     rng, known = np.random.default_rng(_SEED), np.isfinite(course.values)
     if not course.noise > 0.0 or not known.any():
-        return Distortion(0.0, 0.0, 0.0, 0.0, np.nan)
+        return thermal.Distortion(0.0, 0.0, 0.0, 0.0, np.nan)
     smooth = np.full(course.values.shape, np.nan)
     smooth[known] = uniform_filter1d(course.values[known], _SMOOTHED, mode="nearest")
-    still = evaluate_distortion(seconds, smooth)
+    still = thermal.evaluate_distortion(seconds, smooth)
     drawn = [
-        evaluate_distortion(seconds, smooth + course.noise * rng.standard_normal(smooth.size)) for _ in range(_DRAWS)
+        thermal.evaluate_distortion(seconds, smooth + course.noise * rng.standard_normal(smooth.size))
+        for _ in range(_DRAWS)
     ]
     first, whole, last = (
         max(0.0, float(np.mean([getattr(one, name) for one in drawn])) - getattr(still, name))
         for name in ("first_hour", "whole", "last_hour")
     )
-    return Distortion(first, whole, last, 0.0, np.nan)
+    return thermal.Distortion(first, whole, last, 0.0, np.nan)
 
 
-def _distortion(course: _Course, found: Distortion, excess: Distortion) -> ThermalDistortion:
+def _distortion(course: _Course, found: thermal.Distortion, excess: thermal.Distortion) -> ThermalDistortion:
     """Return the ranges of a course with their uncertainties."""
 
     def quantity(name: str) -> Quantity:
@@ -323,11 +307,11 @@ def thermal_tests(campaign: Campaign, measured: SensorHealth | xr.Dataset) -> tu
         ]
     else:
         table = measured
-        drift = group(table, "estimate") if has(table, "estimate") else estimate_joint(table)[0]
+        drift = group(table, "estimate") if has(table, "estimate") else iso230.estimate_joint(table)[0]
         tests = evaluate_axis_test(table, drift, stated_test)
     zone = shown_zone(table, campaign.zone_of("interferometry" if campaign.record is None else "record"))
-    date, keys = date_of(table["time"].values, zone), keys_of("report", of="record")
-    stated = state_conditions(keys, campaign.report.model_dump(by_alias=True), date, campaign.campaign.axis, {})
+    date, keys = iso230.date_of(table["time"].values, zone), keys_of("report", of="record")
+    stated = iso230.state_conditions(keys, campaign.report.model_dump(by_alias=True), date, campaign.campaign.axis, {})
     return tuple(one.model_copy(update={"conditions": stated}) for one in tests)
 
 
@@ -348,7 +332,7 @@ def read_thermal_tests(path: Path) -> StatedTests:
         results = read_results(path)
         if not results.iso230_3:
             raise CampaignError(f"{path}: these results hold no test by ISO 230-3, which needs {_NEEDS}")
-        return StatedTests(results.campaign, results.iso230_3, files_of_run(path), sheet_of_run(path))
+        return StatedTests(results.campaign, results.iso230_3, iso230.files_of_run(path), iso230.sheet_of_run(path))
     if path.suffix != ".toml":
         raise CampaignError(
             f"{path}: name a campaign file or a results folder; thermofuse init writes a campaign file for a table"
@@ -363,4 +347,6 @@ def read_thermal_tests(path: Path) -> StatedTests:
     if not found:
         raise CampaignError(f"{path}: a test by ISO 230-3 needs {_NEEDS}")
     read = {path.name: path, **campaign.files_of(of)}
-    return StatedTests(campaign.campaign.title, found, hashed(read), sheet_files(campaign.sheet, campaign.folder))
+    return StatedTests(
+        campaign.campaign.title, found, iso230.hashed(read), iso230.sheet_files(campaign.sheet, campaign.folder)
+    )

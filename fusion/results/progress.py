@@ -11,16 +11,8 @@ from threading import Event, Thread
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from rich import progress as bars
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -119,7 +111,7 @@ class Reporter(AbstractContextManager["Reporter"]):
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._bars: Progress | None = None
+        self._bars: bars.Progress | None = None
         self._tasks: dict[str, object] = {}
         self._started: dict[str, float] = {}
         self._spoken: dict[str, float] = {}
@@ -133,14 +125,14 @@ class Reporter(AbstractContextManager["Reporter"]):
     def __enter__(self) -> Reporter:
         if self._console.is_terminal:
             columns = (
-                SpinnerColumn(),
-                TextColumn("{task.description:<34}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TimeRemainingColumn(compact=True),
+                bars.SpinnerColumn(),
+                bars.TextColumn("{task.description:<34}"),
+                bars.BarColumn(),
+                bars.MofNCompleteColumn(),
+                bars.TimeElapsedColumn(),
+                bars.TimeRemainingColumn(compact=True),
             )
-            self._bars = Progress(*columns, console=self._console)
+            self._bars = bars.Progress(*columns, console=self._console)
             self._bars.start()
         # A step that hangs reports nothing.
         self._watching.start()
