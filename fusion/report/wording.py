@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from inspect import getmembers, isfunction
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,28 +19,9 @@ from markupsafe import Markup
 from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.library import describe_effect
 from fusion.common.messages import cell, printable
+from fusion.results import numbers
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window
 from fusion.results.loop import ERROR_BY_CHANCE, ChannelErrors, DriftShare, Loop, ModelError, Range, RecordLoop
-from fusion.results.numbers import (
-    alike,
-    decimals_of,
-    duration,
-    exact,
-    fixed,
-    gain,
-    join,
-    lower_first,
-    measured,
-    moment,
-    number,
-    p_cell,
-    p_words,
-    percent,
-    place,
-    print_unit,
-    small,
-    upper_first,
-)
 from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
 from fusion.results.progress import counted
 from fusion.results.results import Results
@@ -131,16 +113,16 @@ def effect_words(name: str) -> EffectWords:
 
 def quantity(found: Quantity, unit: str = "") -> str:
     """Return a quantity of the results as ``value ± U unit``, see `measured`."""
-    return measured(found.value, found.u, unit)
+    return numbers.measured(found.value, found.u, unit)
 
 
 def limited(value: float | None, limits: tuple[float, float] | None, unit: str = "") -> str:
     """Return a value with the limits of its interval as ``value [low to high] unit``."""
     low, high = (None, None) if limits is None else limits
     if value is None or low is None or high is None or not np.isfinite([value, low, high]).all():
-        return measured(value, None, unit)
-    places = decimals_of((high - low) / 4.0)
-    return f"{fixed(value, places)} [{fixed(low, places)} to {fixed(high, places)}]{f' {unit}' if unit else ''}"
+        return numbers.measured(value, None, unit)
+    places = numbers.decimals_of((high - low) / 4.0)
+    return f"{numbers.fixed(value, places)} [{numbers.fixed(low, places)} to {numbers.fixed(high, places)}]{f' {unit}' if unit else ''}"
 
 
 def region_words(name: str) -> str:
@@ -156,7 +138,7 @@ def conditional(sentence: str, inputs: InputsPart | None, *figures: Figures) -> 
     """Return a sentence with the conditions under which it holds."""
     sentence = sentence.strip()
     right = assumption(inputs, *figures)
-    return f"Only if {right}: {lower_first(sentence)}" if right and sentence else sentence
+    return f"Only if {right}: {numbers.lower_first(sentence)}" if right and sentence else sentence
 
 
 def condition(inputs: InputsPart | None, *figures: Figures) -> str:
@@ -168,7 +150,7 @@ def condition(inputs: InputsPart | None, *figures: Figures) -> str:
 def assumption(inputs: InputsPart | None, *figures: Figures) -> str:
     """Return what has to be right for some figures to hold, as it follows "only if"; empty where no doubt touches them."""
     assumptions = inputs.assumptions(*figures) if inputs else ()
-    return join(assumptions) if len(assumptions) <= 2 else f"{len(assumptions)} doubted inputs are right"
+    return numbers.join(assumptions) if len(assumptions) <= 2 else f"{len(assumptions)} doubted inputs are right"
 
 
 def untouched(inputs: InputsPart | None, there: Collection[Figures] = tuple(_FIGURE_WORDS)) -> str:
@@ -176,7 +158,7 @@ def untouched(inputs: InputsPart | None, there: Collection[Figures] = tuple(_FIG
     if inputs is None or not inputs.doubts:
         return ""
     held = [words for figure, words in _FIGURE_WORDS.items() if figure in there and not inputs.assumptions(figure)]
-    return f"Not affected: {join(held)}." if held else ""
+    return f"Not affected: {numbers.join(held)}." if held else ""
 
 
 def parameters(values: Mapping[str, Any], ranges: Mapping[str, Range] | None = None) -> str:
@@ -188,7 +170,7 @@ def parameters(values: Mapping[str, Any], ranges: Mapping[str, Range] | None = N
 def _parameter(name: str, value: Any) -> str:
     """One parameter in words; an instant as time since the start."""
     if name == "time_s" and isinstance(value, int | float):
-        return f"{duration(float(value))} after the start"
+        return f"{numbers.duration(float(value))} after the start"
     for ending, unit in _UNITS.items():
         if name.endswith(ending):
             return f"{name.removesuffix(ending).replace('_', ' ')} {in_words(value)} {unit}"
@@ -200,8 +182,8 @@ def _as_well(name: str, fits: Range) -> str:
     """The values of a parameter that fit as well, in brackets."""
     others = [word for word in fits if isinstance(word, str)]
     if others or not fits:
-        return f" (or {join(others if name == 'sensor' else [in_words(word) for word in others])})"
-    show = duration if name == "time_s" else number
+        return f" (or {numbers.join(others if name == 'sensor' else [in_words(word) for word in others])})"
+    show = numbers.duration if name == "time_s" else numbers.number
     low, high = (None if value is None else show(float(value)) for value in fits)
     if low is None and high is None:
         return " (not determined)"
@@ -211,11 +193,11 @@ def _as_well(name: str, fits: Range) -> str:
 def in_words(value: Any) -> str:
     """Return the value of a parameter or of a piece of evidence for a table cell."""
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return join([in_words(item) for item in value])
+        return numbers.join([in_words(item) for item in value])
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, float | np.floating):
-        return number(float(value), 3)
+        return numbers.number(float(value), 3)
     return "–" if value is None else str(value).replace("_", " ")
 
 
@@ -247,10 +229,11 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
-        anomaly_cause, anomaly_place, by_effect, caption, condition, conditional, counted, drift_size, duration, exact, fixed, gain,
-        limited, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words,
-        small, upper_first, variance_left, whole_percent,
+        anomaly_cause, anomaly_place, by_effect, caption, condition, conditional, counted, drift_size, limited, parameters, quantity,
+        region_words, variance_left, whole_percent,
     )  # fmt: skip
+    # Filters of the templates' own language, such as join, stay.
+    made.filters = {**dict(getmembers(numbers, isfunction)), **made.filters}
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {
         "channel": lambda name: CHANNELS.get(name, name),
@@ -260,7 +243,7 @@ def environment(*, html: bool) -> jinja2.Environment:
         "effect": effect_words,
         "input_name": lambda name: INPUT_NAMES.get(name, name),
         "is_record": lambda loop: isinstance(loop, RecordLoop),
-        "listed": join,
+        "listed": numbers.join,
         "scatter_um": scatter_of,
     }
     made.globals["text"] = Words
@@ -269,7 +252,7 @@ def environment(*, html: bool) -> jinja2.Environment:
         "numeric": lambda title: not isinstance(title, Words),
     }
     found = (
-        alike, baseline_words, beaten_by_repetition, better_plain, drift_extremes, extrapolates, figures_of, figures_of_anomalies,
+        numbers.alike, baseline_words, beaten_by_repetition, better_plain, drift_extremes, extrapolates, figures_of, figures_of_anomalies,
         quoted_term, quoted_values, randomised_causes, untouched, worse_channels,
     )  # fmt: skip
     made.globals |= {"say": say, **{function.__name__: function for function in found}}
@@ -300,7 +283,7 @@ def caption(chart: str) -> str:
 
 def iso230_values(iso: Iso230Window) -> dict[str, str]:
     """Return the axis values with their expanded uncertainty (k = 2) by symbol, with their unit."""
-    return {symbol: quantity(getattr(iso, f"{symbol}_um"), print_unit(iso.unit)) for symbol in ISO230_TERMS}
+    return {symbol: quantity(getattr(iso, f"{symbol}_um"), numbers.print_unit(iso.unit)) for symbol in ISO230_TERMS}
 
 
 def quoted_values(iso: Iso230Window) -> dict[str, str]:
@@ -308,7 +291,7 @@ def quoted_values(iso: Iso230Window) -> dict[str, str]:
 
     Of one cycle, which has neither A nor R, they are E, M and B, of one approach E.
     """
-    side, unit = iso.approach, print_unit(iso.unit)
+    side, unit = iso.approach, numbers.print_unit(iso.unit)
     of_side = getattr(iso, side) if side else iso
     once = of_side.A_um.value is None and of_side.E_um.value is not None
     symbols, arrow = ("E" if once else "AR", ARROWS[side]) if side else ("EMB" if once else "ARB", "")
@@ -351,7 +334,7 @@ def drift_extremes(drift: DriftPart) -> tuple[DriftExtreme, DriftExtreme]:
 
 def drift_size(one: DriftExtreme) -> str:
     """Return the range of the drift at one position with its uncertainty, of none that the readings show the bound."""
-    return f"below {number(2 * (one.size.u or 0.0), 2)} µm" if one.negligible else quantity(one.size, "µm")
+    return f"below {numbers.number(2 * (one.size.u or 0.0), 2)} µm" if one.negligible else quantity(one.size, "µm")
 
 
 def anomaly_place(anomaly: AnomalyPart) -> str:
@@ -448,7 +431,7 @@ def better_plain(loop: Loop) -> PlainPrediction | None:
 
 def variance_left(share: float | None) -> str:
     """Return the share of a variance that a prediction leaves, in per cent; "all" where the mean itself would leave less."""
-    return "–" if share is None else "all" if share > 1.0 else f"{number(100 * share, 2)} %"
+    return "–" if share is None else "all" if share > 1.0 else f"{numbers.number(100 * share, 2)} %"
 
 
 def by_effect(parts: Iterable[DriftShare]) -> list[DriftShare]:
