@@ -7,12 +7,11 @@ by simulation. The twin shares no code with the analysis but the writers of the 
 
 from fusion.twin.camera import make_view
 from fusion.twin.folders import truth_folder
-from fusion.twin.instruments import simulate_campaign, write_campaign
+from fusion.twin.instruments import deviations_of, fields_of, simulate_campaign, write_campaign
 from fusion.twin.recipe import Recipe, RecipeError
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
 from fusion.twin.record import RecordTruth, simulate_record
 from fusion.twin.simulate import Truth, driver_log, environment_log, simulate
-from fusion.twin.truth import deviations_of, fields_of
 
 __all__ = [
     "Recipe",

@@ -242,6 +242,10 @@ _ON_READINGS = (
 #: Every effect by name.
 EFFECTS = _library("um", *_ON_READINGS) | _library("K", camera_offset, reflected_source)
 
+#: Effects that act on one instrument only and cannot be superposed.
+ONCE = ("reflected_source", "sensor_fault")
+#: Effects that do not need positions, as a record has none.
+IN_A_RECORD = ("thermal_lag", "unseen_heat_source", "step_event", "periodic_disturbance")
 #: Kinds of an anomalous place.
 ANOMALIES = ("structural", "local_temperature", "stick_slip", "step", "wander")
 

@@ -13,13 +13,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from fusion.common import suggest
 from fusion.common.toml_files import Place, TomlError, describe, first_faults, place_in, read_toml
-from fusion.twin.effects import EFFECTS
+from fusion.twin.effects import EFFECTS, ONCE
 from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError
 from thermofuse.resources import resource
 
 _RECIPE = TypeAdapter(Recipe)
-#: Effects that act on one instrument only and cannot be superposed.
-_ONCE = ("reflected_source", "sensor_fault")
 
 
 def read_recipe(path: Path) -> Recipe:
@@ -149,6 +147,6 @@ def _faults_of_effects(recipe: Recipe, place: Place) -> Iterator[str]:
         except ValidationError as error:
             for one in error.errors():
                 yield describe(one, known.table, lambda key, where=where: where)  # type: ignore[misc]
-    for name in _ONCE:
+    for name in ONCE:
         if sum(effect.name == name for effect in recipe.effect) > 1:
             yield f"{place(('effect',))}: effect {name} is there more than once; the twin has one of it, remove the others"

@@ -17,7 +17,7 @@ import xarray as xr
 from scipy.linalg import expm
 
 from fusion.common import CAMPAIGN_FILE, Array
-from fusion.twin.effects import EFFECTS
+from fusion.twin.effects import EFFECTS, IN_A_RECORD
 from fusion.twin.folders import write_truth_nc
 from fusion.twin.machine import Session, first_order, random_levels, stream
 from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError, Record
@@ -47,8 +47,6 @@ JOINTS = (
 #: Powers at full load.
 SPINDLE_W = 320.0
 MOTOR_W = 90.0
-#: Effects of the library that do not need positions.
-IN_A_RECORD = ("thermal_lag", "unseen_heat_source", "step_event", "periodic_disturbance")
 CHANNELS = ("X", "Y", "Z", "A", "B", "C")
 
 

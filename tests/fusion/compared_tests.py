@@ -11,8 +11,8 @@ import xarray as xr
 from fusion.results.results import assemble
 from fusion.results.store import joined, write_dataset, write_json
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of
 from fusion.twin.recipe import Recipe
-from fusion.twin.truth import deviations_of
 from interferometry.drift.estimate import estimate_drift
 from tests.fusion.results_sample import PARTS
 

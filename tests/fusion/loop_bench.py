@@ -20,9 +20,9 @@ from fusion.analysis.drift_model.model import ModelFit, Term, fit_model
 from fusion.analysis.drift_model.predictions import rmse
 from fusion.analysis.effects.library import library
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of, fields_of
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
-from fusion.twin.truth import deviations_of, fields_of
 
 DECLARED = ("axis_expansion", "table_offset")
 CYCLES = 60

@@ -8,8 +8,8 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of, fields_of
 from fusion.twin.recipe import Recipe
-from fusion.twin.truth import deviations_of, fields_of
 
 #: Anomaly that is planted, and what the diagnosis must call it.
 CAUSES = {

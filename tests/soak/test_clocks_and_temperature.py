@@ -17,9 +17,9 @@ from fusion.analysis.consistency.clocks import Motion
 from fusion.analysis.consistency.material import field_at, log_with_camera, thin_fields
 from fusion.pipeline.consistency import Check, run_checks
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of, fields_of
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
-from fusion.twin.truth import deviations_of, fields_of
 from tests.fusion.analysis.consistency.twin_fields import FILES, Recorded, clocks, scaled, with_late, without_ends
 from tests.soak.lies.logs import in_blocks, of_another_test, starts
 from tests.soak.rates import campaigns, first_seed, rate, wilson

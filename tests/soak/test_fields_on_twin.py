@@ -15,9 +15,8 @@ import pytest
 from fusion.analysis.alignment.align import cycle_bounds
 from fusion.twin import simulate
 from fusion.twin.camera import make_view
-from fusion.twin.instruments import write_campaign
+from fusion.twin.instruments import deviations_of, write_campaign
 from fusion.twin.recipe import Recipe
-from fusion.twin.truth import deviations_of
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
 from thermography.io.flir import index_frames

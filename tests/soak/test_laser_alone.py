@@ -12,9 +12,9 @@ from fusion.analysis.alignment.align import align_logs
 from fusion.analysis.alignment.readings import Readings, read_fused
 from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
-from fusion.twin.truth import deviations_of
 from tests.fusion.loop_bench import CYCLES, effect_of
 from tests.soak.rates import campaigns, rate, wilson
 

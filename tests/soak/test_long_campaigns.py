@@ -18,8 +18,8 @@ from fusion.analysis.drift_model.evaluation import LoopResult
 from fusion.analysis.drift_model.search import Reason
 from fusion.pipeline.positioning import average_cycles
 from fusion.twin import simulate
+from fusion.twin.instruments import fields_of
 from fusion.twin.recipe import EffectRecipe, Recipe
-from fusion.twin.truth import fields_of
 from tests.fusion import field_simulator
 from tests.fusion.long_tests import long_test
 from tests.soak.rates import campaigns, first_seed, rate, wilson

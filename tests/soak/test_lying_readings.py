@@ -14,7 +14,7 @@ from fusion.analysis.consistency.checks import Inputs
 from fusion.common import Array
 from fusion.pipeline.consistency import run_checks
 from fusion.twin import simulate
-from fusion.twin.truth import deviations_of
+from fusion.twin.instruments import deviations_of
 from tests.soak.rates import campaigns, first_seed, rate
 from tests.soak.test_sound_inputs import sound_recipe
 

@@ -17,9 +17,9 @@ from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.pipeline.consistency import run_checks
 from fusion.results.loop import ResidualTestsPart
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of, fields_of
 from fusion.twin.recipe import AnomalyRecipe, EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
-from fusion.twin.truth import deviations_of, fields_of
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 
 pytestmark = pytest.mark.slow

@@ -18,9 +18,9 @@ from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.analysis.drift_model.model import fit_model
 from fusion.analysis.effects.library import library
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of, fields_of
 from fusion.twin.recipe import Recipe
 from fusion.twin.simulate import driver_log, environment_log
-from fusion.twin.truth import deviations_of, fields_of
 from tests.fusion.loop_bench import DECLARED, effect_of, readings_of
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.thermography.flir_mutations import PARAMETERS

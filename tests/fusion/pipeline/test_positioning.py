@@ -31,8 +31,8 @@ from fusion.results.axis import Evidence
 from fusion.results.results import Notice
 from fusion.results.store import read_product
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of
 from fusion.twin.recipe_file import read_recipe
-from fusion.twin.truth import deviations_of
 from interferometry.anomalies import Anomaly
 from interferometry.drift.estimate import estimate_drift
 from tests.fusion.campaign_parts import write_laser

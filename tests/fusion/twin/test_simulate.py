@@ -7,6 +7,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from fusion.twin.instruments import deviations_of, fields_of
 from fusion.twin.machine import INNER_PART, Drive, Session, first_order, random_levels, switched_levels
 from fusion.twin.recipe import AnomalyRecipe, Drift, EffectRecipe, Laser, Profile, Recipe
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
@@ -20,7 +21,6 @@ from fusion.twin.simulate import (
     simulate,
     static_profile,
 )
-from fusion.twin.truth import deviations_of, fields_of
 from interferometry.common import DEVIATIONS
 from thermography.common import FIELDS
 

@@ -18,9 +18,9 @@ from fusion.analysis.consistency.courses import compare_drift, compare_load, com
 from fusion.analysis.consistency.material import field_at, thin_fields
 from fusion.pipeline.consistency import Check, run_checks
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of, fields_of
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
-from fusion.twin.truth import deviations_of, fields_of
 
 #: Plan point of the material sensor of the twin, mm.
 SENSOR_MM = PROBE_MM

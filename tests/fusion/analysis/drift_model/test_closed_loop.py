@@ -23,9 +23,9 @@ from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.analysis.effects.effect import Effect, Prior
 from fusion.analysis.effects.library import library
 from fusion.twin import simulate
+from fusion.twin.instruments import deviations_of, fields_of
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
-from fusion.twin.truth import deviations_of, fields_of
 from tests.fusion import loop_bench
 from tests.fusion.small_campaign import campaign
 
