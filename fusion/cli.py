@@ -642,8 +642,7 @@ def verify(
                 [*(f"{one.name}: {one.fault}: {one.reason}" for one in found.channels if one.fault), *found.remarks]
             )
         if out is not None:
-            told = (found.test.conditions, found.test.files, found.test.sheet)
-            write_verification(out, found.after, found.channels, found.remarks, *told)
+            write_verification(out, found.after, found.channels, found.remarks, *found.test)
             errors.print(f"page: {out.resolve()}")
         _end_unless(all(one.is_kept for one in found.channels))
 

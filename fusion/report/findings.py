@@ -110,11 +110,6 @@ def _cameras(results: Results) -> str:
 # Added effects in words: what each is, and what to check.
 
 
-def step_phrase(step: StepPart, time: TimePart | None, *, record: bool) -> str:
-    """Return an added effect with what it follows, or when it happened."""
-    return say("step_phrase", step, time, record)
-
-
 def action(step: StepPart, time: TimePart | None, *, record: bool) -> str:
     """Return what to check on machine or instruments where an effect was missing; empty where the effect states nothing."""
     return say("action", step, time, record)

@@ -252,9 +252,10 @@ def _frames(truth: Truth, progress: Progress | None) -> Iterator[Frame]:
             progress(number + 1, times.size, "render frames")
 
 
-# The truth as the Datasets that ideal instruments and an ideal reduction would hand over, without files: studies by simulation run hundreds of
-# campaigns, and rendering and reading frames would take nearly all of their time. These Datasets keep the contracts of the instruments' own; the
-# fields carry the noise that remains after averaging a frame over a cell.
+# The truth as the Datasets that ideal instruments and an ideal reduction would hand over, without files.
+
+# Studies by simulation run hundreds of campaigns; rendering and reading frames would take nearly all of their time. These Datasets keep
+# the contracts of the instruments' own. The fields carry the noise that remains after averaging a frame over a cell.
 
 _ON_SCALE = {"units": "degC", "units_metadata": "temperature: on_scale"}
 _DIFFERENCE = {"units": "K", "units_metadata": "temperature: difference"}

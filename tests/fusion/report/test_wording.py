@@ -9,7 +9,7 @@ from fusion.pipeline.consistency import inputs_part
 from fusion.report import findings as answers
 from fusion.report import wording
 from fusion.report.campaign import describe_model
-from fusion.report.findings import action, next_steps, step_phrase
+from fusion.report.findings import action, next_steps
 from fusion.report.wording import effect_words, say
 from fusion.results import numbers
 from fusion.results.axis import (
@@ -458,12 +458,12 @@ JUMP = axis_step("step_event", event_cycle=38, event_time="2026-03-09T09:08:00Z"
 
 
 def test_what_an_effect_follows_is_told_with_its_time_constant():
-    assert step_phrase(SOURCE, None, record=False) == (
+    assert say("step_phrase", SOURCE, None, False) == (
         "an unseen heat source (follows the logged duty, time constant 13 min [11 to 15])"
     )
     lagging = axis_step("thermal_lag", parameters={"time_constant_min": 30.0})
-    assert step_phrase(lagging, None, record=False).endswith("(time constant 30 min)")
-    assert step_phrase(axis_step("bed_bending"), None, record=False) == "bed bending"
+    assert say("step_phrase", lagging, None, False).endswith("(time constant 30 min)")
+    assert say("step_phrase", axis_step("bed_bending"), None, False) == "bed bending"
 
 
 def test_effects_that_are_not_separated_are_told_as_one_of_these():
@@ -474,7 +474,7 @@ def test_effects_that_are_not_separated_are_told_as_one_of_these():
     asked = action(tied, None, record=False)
     assert effect_words("thermal_lag").remedy in asked and effect_words("unseen_heat_source").remedy in asked
     open_end = axis_step("thermal_lag", withheld="its time constant is not determined (130 min and more fits)")
-    words = step_phrase(open_end, None, record=False)
+    words = say("step_phrase", open_end, None, False)
     assert words.startswith("something that moves like a part") and words.endswith("130 min and more fits)")
     told = say("verdict", loop("unexplained", open_end), None, False)
     assert f"It holds {words}." in told
@@ -484,7 +484,7 @@ def test_effects_that_are_not_separated_are_told_as_one_of_these():
 def test_an_event_is_told_with_its_size_and_its_local_time():
     assert say("when", JUMP, LOCAL) == "2026-03-09 10:08 CET, cycle 38"
     assert say("when", JUMP, None).startswith("2026-03-09 09:08 UTC")
-    assert step_phrase(JUMP, LOCAL, record=False).endswith("(2.10 ± 0.20 µm, at 2026-03-09 10:08 CET, cycle 38)")
+    assert say("step_phrase", JUMP, LOCAL, False).endswith("(2.10 ± 0.20 µm, at 2026-03-09 10:08 CET, cycle 38)")
     late = RecordStep.model_construct(
         effect="step_event", parameters={}, parameter_ranges={}, event_s=7200.0, event_time=None
     )
@@ -497,10 +497,10 @@ def test_an_event_is_told_with_its_size_and_its_local_time():
         }
     )  # fmt: skip
     told = "a slip (−333.0 ± 4.0 µm in crack 3, 4.0 ± 2.0 µm in crack 2, at 2.0 h after the start (60 min to 3.0 h), within 15.0 h)"
-    assert step_phrase(slip, None, record=True).replace("-", "−") == told
+    assert say("step_phrase", slip, None, True).replace("-", "−") == told
     assert told in say("verdict", loop("no_skill", slip), None, True).replace("-", "−")
     scale = axis_step("step_event", event_cycle=38, parameters={"shape": "linear"})
-    assert step_phrase(scale, None, record=False).startswith("a sudden change in proportion to the position (2.10")
+    assert say("step_phrase", scale, None, False).startswith("a sudden change in proportion to the position (2.10")
     assert "was a mirror realigned" in action(scale, None, record=False)
 
 
