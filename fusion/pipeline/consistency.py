@@ -15,9 +15,9 @@ from fusion.analysis.alignment.readings import ReadingsError, read_fused
 from fusion.analysis.consistency import RULES
 from fusion.analysis.consistency.camera import compare_phase, file_warnings
 from fusion.analysis.consistency.checks import Found, Inputs, Phase, Rule
-from fusion.analysis.consistency.clocks import Evidence, Motion, Recording, compare_clocks
+from fusion.analysis.consistency.clocks import Evidence, Recording, compare_clocks
 from fusion.analysis.consistency.courses import compare_drift, compare_load, compare_material
-from fusion.analysis.consistency.material import field_at, log_with_camera, thin_fields
+from fusion.analysis.consistency.series import Motion, field_at, log_with_camera, thin_fields
 from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import CameraInputs, LaserInputs, Source, is_rotary, overridden_parameters
 from fusion.campaign.inputs import Inputs as Read

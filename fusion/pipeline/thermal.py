@@ -18,7 +18,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
-from fusion.analysis.consistency.material import FieldSeries, field_at, rise_share_u, share_of_zero, thin_fields
+from fusion.analysis.consistency.material import rise_share_u, share_of_zero
+from fusion.analysis.consistency.series import FieldSeries, field_at, thin_fields
 from fusion.campaign.config import RegionTable, ThermographyTable
 from fusion.campaign.inputs import (
     OVERRIDABLE,

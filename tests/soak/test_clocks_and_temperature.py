@@ -13,8 +13,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.consistency.clocks import Motion
-from fusion.analysis.consistency.material import field_at, log_with_camera, thin_fields
+from fusion.analysis.consistency.series import Motion, field_at, log_with_camera, thin_fields
 from fusion.pipeline.consistency import Check, run_checks
 from fusion.twin import simulate
 from fusion.twin.instruments import deviations_of, fields_of

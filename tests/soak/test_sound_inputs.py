@@ -11,8 +11,8 @@ import pytest
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.consistency.material import thin_fields
 from fusion.analysis.consistency.model import compare_lines
+from fusion.analysis.consistency.series import thin_fields
 from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.pipeline.consistency import run_checks
 from fusion.results.loop import ResidualTestsPart

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import both_ends, covered_share, likely_zone_shift
 from fusion.analysis.consistency.checks import CAMERA, CLOCK, Found, check, judge
-from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence, Motion
+from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence
+from fusion.analysis.consistency.series import Motion
 from fusion.common import Array
 from fusion.results.axis import RegistrationPart
 from fusion.results.parts import is_determined

@@ -19,8 +19,7 @@ from fusion.common import Array
 from fusion.results.parts import Figures
 
 if TYPE_CHECKING:
-    from fusion.analysis.consistency.clocks import Motion
-    from fusion.analysis.consistency.material import FieldSeries, Logged
+    from fusion.analysis.consistency.series import FieldSeries, Logged, Motion
     from fusion.results.axis import RegistrationPart
     from thermography.inspection import FileWarning
     from thermography.io.frame import FrameReference

@@ -19,14 +19,8 @@ from fusion.analysis.alignment.readings import Readings, Series
 from fusion.analysis.consistency.checks import LOG, Found, check, judge
 from fusion.analysis.consistency.clocks import COURSES, QUARTER_S, QUARTERS, Evidence
 from fusion.analysis.consistency.logs import SOURCE_S, even_times, loads_of
-from fusion.analysis.consistency.material import (
-    LEAST_FOLLOWED,
-    LEAST_FRAMES,
-    RESOLUTION_K,
-    SENSOR_LAGS_S,
-    FieldSeries,
-    compare_course,
-)
+from fusion.analysis.consistency.material import LEAST_FOLLOWED, RESOLUTION_K, SENSOR_LAGS_S, compare_course
+from fusion.analysis.consistency.series import LEAST_FRAMES, FieldSeries
 from fusion.analysis.drift_model.gains import by_width, profile_gains
 from fusion.analysis.drift_model.model import SHIFT_AND_STRETCH, Term, fit_model, scaled_systems
 from fusion.analysis.effects.effect import Candidate

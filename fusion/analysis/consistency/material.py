@@ -1,154 +1,27 @@
 """Camera against contact sensors: a material sensor of the environment log, and sensors on the plan.
 
-The table's temperature is reduced to series of coarse cells, which are quick to compare at many lags: logs and drift are held against them.
 An emissivity error appears as a gain, a reflected-temperature error as an offset.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.consistency.checks import CAMERA, LOG, Found, check, judge
+from fusion.analysis.consistency.series import (
+    LEAST_CHANGE_K,
+    LEAST_FRAMES,
+    FieldSeries,
+    Logged,
+    field_at,
+    log_with_camera,
+)
 from fusion.common import Array
-from thermography.large_arrays import in_pieces, piece_slices
-
-#: Side of a coarse cell, mm: finer than heat spreads in the minutes between two frames.
-_COARSE_MM = 20.0
-#: Frames nearer to each other than this say the same, s.
-_LEAST_STEP_S = 60.0
-#: Fewest frames from which a course can be distinguished from another one.
-LEAST_FRAMES = 12
-#: Smallest change of the logged temperature that can tell a slope, K.
-LEAST_CHANGE_K = 1.0
-
-
-@dataclass(frozen=True)
-class FieldSeries:
-    """Temperature (n, cells) of the cells that every frame shows whole, degC, with their centres, mm, at times at least a minute apart, s
-    since `start`.
-    """
-
-    start: np.datetime64
-    seconds: Array
-    temperature: Array
-    x_mm: Array
-    y_mm: Array
-
-    def since_start(self, times: NDArray[np.datetime64]) -> Array:
-        """Return times, (m,) datetime64, as seconds since `start`."""
-        return np.asarray((times.astype("datetime64[ns]") - self.start) / np.timedelta64(1, "s"), float)
-
-    def interpolated(self, series: xr.DataArray) -> Array:
-        """Return a series along time at the frames, (n,)."""
-        return np.interp(self.seconds, self.since_start(series["time"].values), series.values)
-
-    def lagged(self, time_constant_s: float) -> Array:
-        """Return what a sensor of a time constant, s, would show on every cell, (n, cells), degC."""
-        return respond(self.temperature, self.seconds, time_constant_s=time_constant_s)
-
-
-def thin_fields(fields: xr.Dataset) -> FieldSeries | None:
-    """Reduce the fields to coarse cells and to frames at least a minute apart."""
-    frames = _thinned(fields)
-    cell_mm = abs(float(np.median(np.diff(fields["x"].values))))
-    count = max(1, round(_COARSE_MM / cell_mm))
-    parts = [
-        frames[some].coarsen(x=count, y=count, boundary="trim").reduce(np.mean) for some in piece_slices(frames.shape)
-    ]
-    return _series(xr.concat(parts, "time") if len(parts) > 1 else parts[0])
-
-
-def field_at(fields: xr.Dataset, place_mm: tuple[float, float]) -> FieldSeries | None:
-    """Reduce the fields to the temperature at one place of the plan: a plane through the cells about it, or the nearest of one or two, in
-    the frames that show them; None where these are too few.
-    """
-    frames = _thinned(fields)
-    y_mm, x_mm = (at.ravel() for at in np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij"))
-    away = np.column_stack([x_mm - place_mm[0], y_mm - place_mm[1]])
-    distance = np.hypot(*away.T)
-    about = np.flatnonzero(distance <= _COARSE_MM)
-    values = np.concatenate([some.reshape(len(some), -1)[:, about].astype(float) for _, some in in_pieces(frames)])
-    shown = np.isfinite(values).sum(axis=0)
-    # A moving table shows the place in some frames: the cells that most of these show.
-    cells = 2 * shown > shown.max(initial=0)
-    whole = np.isfinite(values[:, cells]).all(axis=1)
-    if not cells.any() or whole.sum() < LEAST_FRAMES:
-        return None
-    if cells.sum() < 3:
-        weight = np.eye(cells.sum())[distance[about[cells]].argmin()]
-    else:
-        weight = np.linalg.pinv(np.column_stack([np.ones(cells.sum()), away[about[cells]]]))[0]
-    place = np.array([[place_mm[0]], [place_mm[1]]])
-    return FieldSeries(*_clock(frames[whole]), values[whole][:, cells] @ weight[:, None], *place)
-
-
-def _thinned(fields: xr.Dataset) -> xr.DataArray:
-    """Frames at least a minute apart."""
-    time = fields["time"].values.astype("datetime64[ns]")
-    seconds = (time - time[0]) / np.timedelta64(1, "s")
-    kept = [0]
-    for k in range(1, seconds.size):
-        if seconds[k] - seconds[kept[-1]] >= _LEAST_STEP_S:
-            kept.append(k)
-    return fields["frame_temperature"].isel(time=kept)
-
-
-def _series(frames: xr.DataArray) -> FieldSeries | None:
-    """Cells that all frames show, as series; None where there are too few frames or no such cell."""
-    values = frames.values.reshape(len(frames), -1).astype(float)
-    seen = np.isfinite(values).all(axis=0)
-    if len(frames) < LEAST_FRAMES or not seen.any():
-        return None
-    y, x = np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij")
-    return FieldSeries(*_clock(frames), values[:, seen], x.ravel()[seen], y.ravel()[seen])
-
-
-def _clock(frames: xr.DataArray) -> tuple[np.datetime64, Array]:
-    """Time of the first frame, and seconds of all since then."""
-    time = frames["time"].values.astype("datetime64[ns]")
-    return time[0], (time - time[0]) / np.timedelta64(1, "s")
-
-
-@dataclass(frozen=True)
-class Logged:
-    """What the environment log holds of the table where it covers a frame (`inside` of them), material and air in degC, with what the
-    camera shows near its material sensor, or everywhere where its place is not known.
-    """
-
-    near: FieldSeries
-    inside: Array
-    material: Array
-    air: Array | None = None
-
-    @property
-    def change_K(self) -> float:
-        """Range of the material temperature."""
-        return float(np.ptp(self.material))
-
-    @property
-    def tells(self) -> bool:
-        """Whether it changes enough, over enough frames, to be compared."""
-        return self.change_K >= LEAST_CHANGE_K and bool(self.inside.sum() >= LEAST_FRAMES)
-
-
-def log_with_camera(near: FieldSeries | None, log: xr.Dataset | None) -> Logged | None:
-    """Bring the environment log to the frames; None where they have nothing in common."""
-    if near is None or log is None or "material_temperature" not in log:
-        return None
-    at = near.since_start(log["time"].values)
-    inside = (near.seconds >= at[0]) & (near.seconds <= at[-1])
-    if inside.sum() < 2:
-        return None
-    names = [name for name in ("material_temperature", "air_temperature") if name in log]
-    return Logged(near, inside, *(np.interp(near.seconds[inside], at, log[name].values) for name in names))
-
 
 #: Largest difference between camera and sensors in standard uncertainties.
 _LIMIT = 3.0

@@ -21,7 +21,7 @@ from fusion.analysis.consistency.camera import (
     zero_share,
 )
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.consistency.clocks import Motion
+from fusion.analysis.consistency.series import Motion
 from fusion.pipeline.consistency import Check, _worded, run_checks
 from fusion.results.axis import RegistrationPart
 from tests.fusion.analysis.consistency.twin_fields import recorded

@@ -15,7 +15,7 @@ from fusion.analysis.consistency.courses import (
     compare_load,
     compare_material,
 )
-from fusion.analysis.consistency.material import FieldSeries, field_at, thin_fields
+from fusion.analysis.consistency.series import FieldSeries, field_at, thin_fields
 from fusion.pipeline.consistency import Check, run_checks, without_consequences
 from fusion.report.wording import sentences
 from tests.fusion.analysis.consistency.twin_fields import (

@@ -14,8 +14,8 @@ import xarray as xr
 
 from fusion.analysis.consistency import RULES
 from fusion.analysis.consistency.checks import Inputs, Rule
-from fusion.analysis.consistency.clocks import Motion, Recording, compare_clocks
-from fusion.analysis.consistency.material import field_at, log_with_camera, thin_fields
+from fusion.analysis.consistency.clocks import Recording, compare_clocks
+from fusion.analysis.consistency.series import Motion, field_at, log_with_camera, thin_fields
 from fusion.pipeline.consistency import Check, _worded, run_checks
 from fusion.results.axis import RegistrationPart
 from tests.fusion.analysis.consistency import test_camera, test_deviations, test_logs, test_model

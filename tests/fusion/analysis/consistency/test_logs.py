@@ -9,14 +9,8 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.consistency.material import (
-    FieldSeries,
-    field_at,
-    log_with_camera,
-    rise_share_u,
-    share_of_zero,
-    thin_fields,
-)
+from fusion.analysis.consistency.material import rise_share_u, share_of_zero
+from fusion.analysis.consistency.series import FieldSeries, field_at, log_with_camera, thin_fields
 from fusion.pipeline.consistency import Check, _together, run_checks
 from tests.fusion.analysis.consistency.twin_fields import SENSOR_MM, recorded, scaled
 

@@ -13,9 +13,9 @@ from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import Readings, read_fused
 from fusion.analysis.consistency.camera import compare_phase
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.consistency.clocks import Evidence, Motion, Recording, compare_clocks
+from fusion.analysis.consistency.clocks import Evidence, Recording, compare_clocks
 from fusion.analysis.consistency.courses import compare_drift, compare_load, compare_material
-from fusion.analysis.consistency.material import field_at, thin_fields
+from fusion.analysis.consistency.series import Motion, field_at, thin_fields
 from fusion.pipeline.consistency import Check, run_checks
 from fusion.twin import simulate
 from fusion.twin.instruments import deviations_of, fields_of
