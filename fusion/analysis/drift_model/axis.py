@@ -880,6 +880,10 @@ class AxisResult(LoopResult):
         )
 
     @property
+    def _terms(self) -> Sequence[Term]:
+        return self.after.terms
+
+    @property
     def _drift(self) -> list[Array]:
         return drift_of(self.after)
 

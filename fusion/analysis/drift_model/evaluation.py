@@ -644,6 +644,11 @@ class LoopResult:
         """What is left."""
 
     @property
+    def _terms(self) -> Sequence[Term]:
+        """Terms of the final model, in the order of `_drift`."""
+        return self.state.model.terms
+
+    @property
     @abstractmethod
     def _drift(self) -> list[Array]:
         """What every term of the final model makes of the drift, and last what is left, (n,) or (n, channels) about their means, um."""
@@ -657,7 +662,7 @@ class LoopResult:
     def _followed(self) -> tuple[list[schema.DriftShare], float]:
         """Shares of the drift by what it follows, and the share of what is left; of that is what unseen readings do not support."""
         *parts, left = self._drift
-        names = [*self.declared, *(term.effect for term in self.state.added)]
+        names = [term.effect for term in self._terms]
         # Errors of the camera that were taken out of the fields are steps, and no terms of the model any more.
         steps = [step for step in self.steps if step.effect in names]
         away = {len(self.declared) + place for place in unsupported_places(steps)}

@@ -235,6 +235,16 @@ def test_on_fields_of_which_nothing_is_corrected_the_same_is_found_again(monkeyp
     again = axis.on_corrected_fields(twice, problem.readings, (), effects=effects)
     assert again.rmse_final_um == pytest.approx(forecast, rel=1e-6) != pytest.approx(neither, rel=1e-3)
 
+    # An error of the camera that was taken out of the fields is a step without a term: shares keep the names of their own terms.
+    own, other = found.after.terms
+    with_camera = fit_model(problem.readings, [own, Term("camera", second), other])
+    camera = found.steps[0].model_copy(update={"effect": "camera"})
+    corrected = replace(
+        found, state=replace(found.state, model=with_camera, steps=both), steps=[camera, *found.steps], away=frozenset()
+    )
+    kept = ["other"] if found.steps[0].keeps_name else []
+    assert [share.effect for share in corrected._followed[0]] == ["own", *kept]
+
 
 @pytest.mark.parametrize("withheld", ["", "its time constant is not determined"])
 def test_coefficients_move_with_what_else_an_added_effect_may_be(withheld):
