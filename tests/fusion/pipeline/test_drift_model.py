@@ -247,8 +247,8 @@ def test_the_loop_stands_beside_the_readings_and_the_attribution_in_a_group():
 def test_an_error_of_reading_stays_out_where_the_fields_are_corrected(monkeypatch):
     deviations = xr.Dataset({"deviation": ("reading", [1.0, 900.0, 3.0])})
     fused = xr.Dataset({"deviation": ("reading", [1.0, np.nan, 3.0])})
-    monkeypatch.setattr(drift_model, "find_field_errors", lambda *given: ["an error"])
-    monkeypatch.setattr(drift_model, "correct_fields", lambda *given: None)
+    monkeypatch.setattr(drift_model.axis_loop, "find_field_errors", lambda *given: ["an error"])
+    monkeypatch.setattr(drift_model.axis_loop, "correct_fields", lambda *given: None)
     monkeypatch.setattr(drift_model, "align", lambda used, *given, **named: used)
     source = SimpleNamespace(axis=None, environment=None, drivers=None)
     corrected = drift_model.correct_camera(source, None, None, fused, deviations)

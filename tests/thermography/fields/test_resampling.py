@@ -11,7 +11,7 @@ from tests.thermography.plan_scene import DISCS, GRID, overhead, registered
 from thermography.common import ThermographyError
 from thermography.fields.resampling import LEAST_COVERAGE, centring_matrix, plan_weights, plan_window
 from thermography.registration.plan import Fiducial, PlanGrid, mask_discs
-from thermography.registration.register import register_points
+from thermography.registration.register import Registration, register_points
 
 #: Cells of 10 x 10 px. Pixel centres lie at multiples of 0.5 mm less a quarter: pixel borders are cell borders.
 PLAN = PlanGrid(60, 40, 5)
@@ -107,7 +107,7 @@ def test_pixels_on_borders_of_cells_are_divided():
 
 
 @pytest.mark.parametrize("cell_mm", [8.0, 3.0, 2.0, 1.5, 1.0, 0.5, 0.2])
-def test_cells_of_every_size_are_seen_by_the_pixels_above_them(cell_mm):
+def test_cells_of_every_size_are_seen_by_the_pixels_above_them(cell_mm, monkeypatch):
     """Pixels of 3 mm, turned by a degree: all cells inside the margin are seen, and a linear field is true within half a pixel."""
     grid = PlanGrid(72, 48, cell_mm)
     corners = [
@@ -117,7 +117,8 @@ def test_cells_of_every_size_are_seen_by_the_pixels_above_them(cell_mm):
     on_sensor = {one.name: 4.0 + 3.0j + along * complex(one.x_mm, one.y_mm) for one in corners}
     picked = {name: (place.real, place.imag) for name, place in on_sensor.items()}
     registration = replace(register_points(picked, corners, (24, 32)), masked=())
-    weights = plan_weights(registration, grid, margin_px=0.0)
+    monkeypatch.setattr(Registration, "margin_px", 0.0)
+    weights = plan_weights(registration, grid)
     inner = grid.contains(grid.centres_mm, margin_mm=3.0 + cell_mm)
     assert inner.any() and (weights.coverage[inner] >= LEAST_COVERAGE).all()
     rows, columns = weights.window
