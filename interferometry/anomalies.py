@@ -306,10 +306,11 @@ def _scatter_direction(estimated: xr.Dataset, target: int, others: NDArray[np.in
     if variance.size < 2 or not np.isfinite(variance).all():
         return str(names[int(np.isfinite(variance).argmax())])
     of_others = estimated["scatter"].values[:, others] ** 2
-    # A direction may be known here alone, and noise with memory can leave the scatter of most positions at zero: there is nothing to
-    # compare it with.
-    known = np.isfinite(of_others).any(axis=1).all()
-    if not known or not ((typical := np.nanmedian(of_others, axis=1)) > 0).all():
+    # There is nothing to compare a direction with where it is known here alone, or where noise with memory leaves most positions none.
+    if not np.isfinite(of_others).any(axis=1).all():
+        return "both"
+    typical = np.nanmedian(of_others, axis=1)
+    if not (typical > 0).all():
         return "both"
     weak = int(np.argmin(variance / typical))
     strong = 1 - weak
