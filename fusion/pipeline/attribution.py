@@ -172,13 +172,12 @@ def _describe_correlation(
     drift, channels = session["unexplained_drift"], session["channel"].values
     known = session.sel(channel="common" if "common" in channels else channels[0])
     noise_um, drift_um = float(known["noise"]), max(float(known["unexplained_drift"]), 0.01)
-    strength = source.sensitivity_um_per_K.model_dump(exclude_unset=True)
     scale_u = place_scale_u(fields, *np.array([source.x_mm, source.y_mm], float))
     area = regions[source.name] if source.kind == "region" else source.area
     limits = np.array([source.sensitivity_um_per_K.value, *(source.sensitivity_interval_um_per_K or ())], float)
     completed = {
         "area": area,
-        "sensitivity_um_per_K": Sensitivity(**scaled(strength, scale_u)),
+        "sensitivity_um_per_K": scaled(source.sensitivity_um_per_K, scale_u),
         "sensitivity_interval_um_per_K": _with_scale(limits, scale_u),
     }
     return schema.CorrelationPart(
@@ -199,7 +198,7 @@ def _describe_correlation(
 
 
 def _sensitivity(found: xr.Dataset, scale_u: float) -> Sensitivity:
-    return Sensitivity(**scaled({"value": float(found["sensitivity"]), "u": float(found["sensitivity_u"])}, scale_u))
+    return scaled(Sensitivity(value=float(found["sensitivity"]), u=float(found["sensitivity_u"])), scale_u)
 
 
 def _with_scale(found: Array, scale_u: float) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -24,6 +24,7 @@ from fusion.campaign.inputs import Inputs as Read
 from fusion.common import FusionError
 from fusion.report.wording import check_words
 from fusion.results.axis import RegistrationPart
+from fusion.results.loop import AxisLoop
 from fusion.results.parts import CheckPart, Figures, InputsPart
 from fusion.results.results import Notice
 from thermography.io.other_cameras import TemperatureFrame
@@ -190,7 +191,7 @@ def check_plan(source: CameraInputs, registration: RegistrationPart | None) -> l
     return run_checks("plan", Inputs(registration=registration, fiducials_file=source.fiducials_file))
 
 
-def check_loop(loop: Mapping[str, Any], source: LaserInputs) -> list[Check]:
+def check_loop(loop: AxisLoop, source: LaserInputs) -> list[Check]:
     """Check what the closed loop fitted against physics."""
     return run_checks("loop", Inputs(loop=loop, travel_mm=float(np.abs(source.deviations["position"]).max())))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -23,12 +23,21 @@ from fusion.analysis.effects.thermal import EXPANSION_U_PPM_PER_K
 from fusion.campaign.inputs import Inputs, LaserInputs, Source
 from fusion.campaign.time_zones import utc
 from fusion.pipeline.positioning import diagnose_positions, sites_of
-from fusion.results import store
-from fusion.results.loop import ResidualTestsPart
+from fusion.results.axis import AnomalyPart
+from fusion.results.loop import (
+    AxisLoop,
+    AxisStep,
+    Coefficient,
+    DeclaredCoefficient,
+    Parameter,
+    ResidualDrift,
+    ResidualTestsPart,
+)
 from fusion.results.numbers import upper_first
+from fusion.results.parts import Sensitivity, determined
 from fusion.results.progress import Report, counted
 from fusion.results.results import Notice, Outcome, Parts
-from fusion.results.store import joined
+from fusion.results.store import GLOBAL_ATTRIBUTES, joined
 from thermography.fields.cycle_fields import cycles_with_field
 
 # The scale of the rise in what is fitted to it: an error of the rise by one percent is one of every coefficient per
@@ -60,77 +69,80 @@ def place_scale_u(fields: xr.Dataset, x_mm: float, y_mm: float) -> float:
     return plan_scale_u(fields)
 
 
-def scaled(entry: Mapping[str, Any], scale_u: float, by_zero: float = 0.0) -> dict[str, Any]:
+PerKelvin = TypeVar("PerKelvin", bound=Sensitivity)
+OfEffect = TypeVar("OfEffect", bound=Coefficient)
+
+
+def scaled(entry: PerKelvin, scale_u: float, by_zero: float = 0.0) -> PerKelvin:
     """Return a quantity per kelvin of the rise with both parts of its uncertainty; `by_zero` is what the camera's zero may hide of it."""
-    value, u = entry["value"], entry["u"]
-    expected = 0.0 if entry.get("prior") is None else entry["prior"] * u**2 / entry["prior_u"] ** 2
-    u_scale = float(np.hypot((value - expected) * scale_u, by_zero))
-    return {**entry, "u": float(np.hypot(u, u_scale)), "u_fit": u, "u_scale": u_scale}
+    u_fit = determined(entry.u)
+    u_scale = float(np.hypot((determined(entry.value) - entry.expected) * scale_u, by_zero))
+    return entry.model_copy(update={"u": float(np.hypot(u_fit, u_scale)), "u_fit": u_fit, "u_scale": u_scale})
 
 
-def hidden_by_zero(loop: Mapping[str, Any], fields: xr.Dataset, position_mm: np.ndarray) -> dict[str, float]:
+def hidden_by_zero(drift: ResidualDrift, fields: xr.Dataset, position_mm: np.ndarray) -> dict[str, float]:
     """Return by unit how much of a coefficient per kelvin an unknown zero of the camera may hide.
 
     A zero that swings as the table warms makes the rise another course, so that a coefficient is too small and what it lacks is left as
     drift: at most that drift per kelvin, in the share that the zero has of the rise.
     """
-    rise = mean_rise(fields)
-    swing_K, drift = max(float(np.nanstd(rise)), 1e-3), loop["residual_drift"]
+    swing_K = max(float(np.nanstd(mean_rise(fields))), 1e-3)
     metres = 1e-3 * max(float(np.sqrt(np.mean(position_mm**2))), 1.0)
     share = zero_share(fields)
     return {
-        "um/K": share * drift["common_rms_um"] / swing_K,
-        "ppm/K": share * drift["stretch_rms_um"] / (metres * swing_K),
+        "um/K": share * determined(drift.common_rms_um) / swing_K,
+        "ppm/K": share * determined(drift.stretch_rms_um) / (metres * swing_K),
     }
 
 
-def with_spread(entry: Mapping[str, Any]) -> dict[str, Any]:
+def with_spread(entry: DeclaredCoefficient) -> DeclaredCoefficient:
     """Return a declared coefficient whose uncertainty is no smaller than what it moves when a target or a part of the test is left out."""
-    moved, fitted = entry.get("jackknife_u"), entry.get("u_fit", entry["u"])
-    if moved is None or not np.isfinite(moved):
-        return dict(entry)
+    if not np.isfinite(entry.moved_u):
+        return entry
     # What was expected beforehand does not move.
-    share = 1.0 if entry.get("prior") is None else max(0.0, 1.0 - (fitted / entry["prior_u"]) ** 2)
-    return {**entry, "u": float(np.sqrt(entry["u"] ** 2 + max(0.0, (share * moved) ** 2 - fitted**2)))}
+    moved = max(0.0, 1.0 - entry.expected_share) * entry.moved_u
+    return entry.model_copy(
+        update={"u": float(np.sqrt(determined(entry.u) ** 2 + max(0.0, moved**2 - entry.fitted_u**2)))}
+    )
 
 
 def scale_coefficients(
-    loop: dict[str, Any],
+    loop: AxisLoop,
     effects: Mapping[str, Effect],
     *,
     axis_u: float,
     plan_u: float,
     by_zero: Mapping[str, float] | None = None,
-) -> dict[str, Any]:
-    """Return the part ``loop`` of results.json with the scale of the rise in every coefficient per kelvin of it."""
+) -> AxisLoop:
+    """Return the closed loop with the scale of the rise in every coefficient per kelvin of it."""
     hidden = by_zero or {}
 
-    def completed(entry: Mapping[str, Any], effect: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    def completed(entry: OfEffect, effect: str, parameters: Mapping[str, Parameter]) -> OfEffect:
         of_rise = parameters.get("follows") == "mean_rise" or (effect in effects and effects[effect].follows_field)
         if not of_rise:
-            return dict(entry)
-        return scaled(entry, axis_u if entry["unit"] == "ppm/K" else plan_u, hidden.get(entry["unit"], 0.0))
+            return entry
+        return scaled(entry, axis_u if entry.unit == "ppm/K" else plan_u, hidden.get(entry.unit, 0.0))
 
-    declared = [completed(entry, entry["effect"], {}) for entry in loop["declared_coefficients"]]
+    declared = tuple(completed(entry, entry.effect, {}) for entry in loop.declared_coefficients)
     steps = []
-    for step in loop["steps"]:
-        coefficients = [completed(entry, step["effect"], step["parameters"]) for entry in step["coefficients"]]
-        steps.append({**step, "coefficients": coefficients})
-    return {**loop, "declared_coefficients": declared, "steps": steps}
+    for step in loop.steps:
+        coefficients = tuple(completed(entry, step.effect, step.parameters) for entry in step.coefficients)
+        steps.append(step.model_copy(update={"coefficients": coefficients}))
+    return loop.model_copy(update={"declared_coefficients": declared, "steps": tuple(steps)})
 
 
 def scale_evidence(
-    anomaly: dict[str, Any], axis: AxisGeometry, fields: xr.Dataset, position_mm: xr.DataArray
-) -> dict[str, Any]:
-    """Return an entry of ``anomalies`` with the scale of the rise in its displacement per local rise."""
-    evidence = anomaly["evidence"]
-    if evidence.get("temperature_um_per_K") is None:
+    anomaly: AnomalyPart, axis: AxisGeometry, fields: xr.Dataset, position_mm: xr.DataArray
+) -> AnomalyPart:
+    """Return an anomaly with the scale of the rise in its displacement per local rise."""
+    evidence = anomaly.evidence
+    if not np.isfinite(determined(evidence.temperature_um_per_K)):
         return anomaly
-    x, y = axis.points(position_mm.sel(target=[anomaly["target"]]).values)
-    entry = {"value": evidence["temperature_um_per_K"], "u": evidence["temperature_u_um_per_K"]}
-    both = scaled(entry, place_scale_u(fields, float(x[0]), float(y[0])))
-    numbers = {"temperature_u_um_per_K": both["u"], "temperature_scale_u_um_per_K": both["u_scale"]}
-    return {**anomaly, "evidence": {**evidence, **numbers}}
+    x, y = axis.points(position_mm.sel(target=[anomaly.target]).values)
+    of_rise = Sensitivity(value=evidence.temperature_um_per_K, u=evidence.temperature_u_um_per_K)
+    both = scaled(of_rise, place_scale_u(fields, float(x[0]), float(y[0])))
+    numbers = {"temperature_u_um_per_K": both.u, "temperature_scale_u_um_per_K": both.u_scale}
+    return anomaly.model_copy(update={"evidence": evidence.model_copy(update=numbers)})
 
 
 def _last_rise(fields: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -188,24 +200,24 @@ def model_drift(
     positions = diagnose_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
     result = axis_loop.set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
     report("anomalies", 1, 1)
-    anomalies, line = [store.plain(position) for position in positions], None
+    line = None
     if isinstance(source, Source) and fields is not None:
         line = compare_lines(result.after, len(result.declared), axis_loop.correct_fields(fields, errors), source.axis)
-    described = result.described(ResidualTestsPart(**tests), field_corrections=errors, axis_line=line)
-    loop = described.model_dump(exclude_unset=True)
+    loop = result.described(ResidualTestsPart(**tests), field_corrections=errors, axis_line=line)
     if isinstance(source, Source) and fields is not None:
-        anomalies = [scale_evidence(one, source.axis, fields, deviations["position"]) for one in anomalies]
+        positions = [scale_evidence(one, source.axis, fields, deviations["position"]) for one in positions]
         position_mm = deviations["position"].values
-        axis_u, hidden = axis_scale_u(fields, source.axis, position_mm), hidden_by_zero(loop, fields, position_mm)
+        axis_u = axis_scale_u(fields, source.axis, position_mm)
+        hidden = hidden_by_zero(loop.residual_drift, fields, position_mm)
         loop = scale_coefficients(loop, effects, axis_u=axis_u, plan_u=plan_scale_u(fields), by_zero=hidden)
-        declared = [with_line(entry, loop.get("axis_line")) for entry in loop["declared_coefficients"]]
-        loop = {**loop, "declared_coefficients": declared}
     elif "axis_scale_u" in fused:
         scale_u = float(fused["axis_scale_u"])
         loop = scale_coefficients(loop, effects, axis_u=scale_u, plan_u=scale_u)
-    loop = withhold_names(loop, effects)
-    loop = {**loop, "declared_coefficients": [with_spread(entry) for entry in loop["declared_coefficients"]]}
-    parts = Parts(anomalies=anomalies, loop={**loop, "steps": with_event_times(loop["steps"], result, fused)})
+    loop = withhold_names(with_line(loop), effects)
+    declared = tuple(with_spread(entry) for entry in loop.declared_coefficients)
+    steps = with_event_times(loop.steps, result, fused)
+    loop = loop.model_copy(update={"declared_coefficients": declared, "steps": steps})
+    parts = Parts(anomalies=positions, loop=loop)
     return Outcome(variables, parts, (*gap_notices(readings), *field_notices(errors)))
 
 
@@ -285,7 +297,7 @@ def join_fusion(
         return xr.DataTree(root)
     groups = {path: node.to_dataset() for path, node in maps.subtree_with_keys}
     correlation = xr.DataTree.from_dict({path: _over_all_targets(one, fused, modelled) for path, one in groups.items()})
-    correlation.attrs = {name: value for name, value in maps.attrs.items() if name not in store.GLOBAL_ATTRIBUTES}
+    correlation.attrs = {name: value for name, value in maps.attrs.items() if name not in GLOBAL_ATTRIBUTES}
     return xr.DataTree(root, children={"correlation": correlation})
 
 
@@ -321,15 +333,13 @@ def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Map
 
 
 def with_event_times(
-    steps: Sequence[Mapping[str, Any]], result: axis_loop.AxisResult, fused: xr.Dataset
-) -> list[dict[str, Any]]:
-    """Entries of ``loop.steps`` with the time of day of every event."""
+    steps: Sequence[AxisStep], result: axis_loop.AxisResult, fused: xr.Dataset
+) -> tuple[AxisStep, ...]:
+    """The steps of the loop with the time of day of every event."""
     start = fused["time"].values[fused["deviation"].notnull().values].min()
     events_s = [term.candidate.event_s for term in result.state.added]
-    return [
-        {**step, "event_time": None if at is None else utc(start + np.timedelta64(round(1000.0 * at), "ms"))}
-        for step, at in zip(steps, events_s, strict=True)
-    ]
+    times = [None if at is None else utc(start + np.timedelta64(round(1000.0 * at), "ms")) for at in events_s]
+    return tuple(step.model_copy(update={"event_time": at}) for step, at in zip(steps, times, strict=True))
 
 
 def prediction_variables(fused: xr.Dataset, result: axis_loop.AxisResult) -> dict[str, xr.Variable]:

@@ -49,9 +49,10 @@ from fusion.pipeline.thermal import camera_corrected
 from fusion.pipeline.thermograms import csv_of, evaluate_thermograms, has_regions
 from fusion.pipeline.workers import Worker
 from fusion.results.folder import claim, discard, open_folder, read_manifest
+from fusion.results.loop import AxisLoop
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Results, assemble
-from fusion.results.store import StageStamps, is_large, open_dataset, plain, write_dataset, write_json, write_text
+from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
 from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
@@ -388,8 +389,8 @@ def _check(
         assert isinstance(source, CameraInputs)
         checks += [*consistency.check_plan(source, run.parts.registration), *field_checks()]
     if model is not None:
-        assert isinstance(source, LaserInputs)
-        checks += consistency.check_loop(plain(run.parts.loop), source)
+        assert isinstance(source, LaserInputs) and isinstance(run.parts.loop, AxisLoop)
+        checks += consistency.check_loop(run.parts.loop, source)
     return checks
 
 

@@ -5,11 +5,12 @@ A p-value of 0.001 stands for any smaller one (`fusion.results.parts.PValue`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Literal
 
 from fusion.results.numbers import alike, measured, print_unit
-from fusion.results.parts import Number, PValue, Quantity, ResultPart, Sensitivity
+from fusion.results.parts import Number, PValue, Quantity, ResultPart, Sensitivity, determined
 
 Verdict = Literal["complete", "explained", "partial", "unexplained", "no_skill"]
 #: What readings that an effect was not fitted to say of it; "no": they contradict it.
@@ -49,6 +50,21 @@ class Coefficient(Sensitivity):
     u_line: Number = None
     """The part of the line on the plan; absent where lines that fit as well as the declared one ask for about the same."""
 
+    @property
+    def expected_share(self) -> float:
+        """Share of its value that was expected beforehand, 1; 0 where nothing was."""
+        return 0.0 if self.prior is None else (self.fitted_u / determined(self.prior_u)) ** 2
+
+    @property
+    def expected(self) -> float:
+        """What of its value was expected beforehand; 0 where nothing was."""
+        return 0.0 if self.prior is None else self.expected_share * self.prior
+
+    @property
+    def moved_u(self) -> float:
+        """Standard deviation by which it moves when a part of the test is left out; 0 where that is not looked at."""
+        return 0.0
+
 
 class DeclaredCoefficient(Coefficient):
     """A coefficient of a declared effect; that of ``axis_expansion`` with the share of its lagged copies: of an axis that has settled."""
@@ -57,6 +73,11 @@ class DeclaredCoefficient(Coefficient):
     """Name of the effect."""
     jackknife_u: Number = None
     """Standard deviation by which it moves when a target or a part of the test is left out; null where it rests on one of them alone."""
+
+    @property
+    def moved_u(self) -> float:
+        """The same, infinite where it rests on one of them alone."""
+        return math.inf if self.jackknife_u is None else self.jackknife_u
 
 
 class HeldOutError(ResultPart):

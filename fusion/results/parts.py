@@ -31,6 +31,11 @@ Number = float | None
 PValue = Annotated[Number, AfterValidator(lambda p: p if p is None else max(p, LEAST_P))]
 
 
+def determined(number: Number) -> float:
+    """Return a number as the analysis has it: NaN where the data do not determine it."""
+    return math.nan if number is None else number
+
+
 class ResultPart(BaseModel):
     """Base class of every part: immutable, without unknown keys, each field described by its docstring."""
 
@@ -89,6 +94,16 @@ class Sensitivity(Quantity):
     """The part of the fit, the rise taken as exact."""
     u_scale: Number = None
     """The part of the scale of the rise (emissivity, reflections, air, camera)."""
+
+    @property
+    def fitted_u(self) -> float:
+        """Its standard uncertainty with the rise taken as exact."""
+        return determined(self.u if self.u_fit is None else self.u_fit)
+
+    @property
+    def expected(self) -> float:
+        """What of its value was expected beforehand; 0 where nothing was."""
+        return 0.0
 
 
 class ByDirection(ResultPart):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import AxisGeometry
 from fusion.pipeline.drift_model import axis_scale_u, scaled
+from fusion.results.parts import Sensitivity
 from tests.soak.rates import campaigns, first_seed
 from thermography.fields.total_uncertainty import evaluate_uncertainty
 from thermography.io.frame import CameraParameters
@@ -92,9 +93,9 @@ def measured(nominal: float, change: str, rng: np.random.Generator) -> tuple[flo
         strain[k] = 1e-3 * total[:, TARGETS_MM.astype(int)]
     drift = EXPANSION_PPM_PER_K * strain[0] + NOISE_UM * rng.standard_normal(strain[0].shape)
     square = float((strain[1] ** 2).sum())
-    entry = {"value": float((strain[1] * drift).sum()) / square, "u": NOISE_UM / np.sqrt(square)}
+    entry = Sensitivity(value=float((strain[1] * drift).sum()) / square, u=NOISE_UM / np.sqrt(square))
     whole = scaled(entry, axis_scale_u(done, AxisGeometry((40.0, 90.0), (1.0, 0.0)), TARGETS_MM))
-    return temperature, rise, (whole["value"] - EXPANSION_PPM_PER_K) / whole["u"]
+    return temperature, rise, (whole.value - EXPANSION_PPM_PER_K) / whole.u
 
 
 @pytest.mark.parametrize("change", ["at once", "grows", "logged"])

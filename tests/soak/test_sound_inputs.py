@@ -89,7 +89,7 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
         fused = align(deviations, fields, axis, environment=environment, drivers=drivers)
         result = close_loop(read_fused(fused), ["axis_expansion", "table_offset"])
         line = compare_lines(result.after, len(result.declared), fields, axis)
-        loop = result.described(ResidualTestsPart.model_construct(), axis_line=line).model_dump(exclude_unset=True)
+        loop = result.described(ResidualTestsPart.model_construct(), axis_line=line)
         extent_mm, logs = truth.recipe.plan.width_mm, {"environment": environment, "drivers": drivers}
         of_source = Inputs(
             linear=deviations, deviations=deviations, plan_extent_mm=extent_mm, reading_time=deviations["time"], **logs

@@ -21,6 +21,7 @@ from fusion.results.parts import Figures
 if TYPE_CHECKING:
     from fusion.analysis.consistency.series import FieldSeries, Logged, Motion
     from fusion.results.axis import RegistrationPart
+    from fusion.results.loop import AxisLoop
     from thermography.inspection import FileWarning
     from thermography.io.frame import FrameReference
 
@@ -119,7 +120,7 @@ class Inputs:
     sensor_u_K: float | None = None
     registration: RegistrationPart | None = None
     fiducials_file: str | None = None
-    loop: Mapping[str, Any] | None = None
+    loop: AxisLoop | None = None
     travel_mm: float | None = None
 
 

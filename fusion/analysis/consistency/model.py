@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -20,7 +19,8 @@ from fusion.analysis.drift_model.search import say
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
 from fusion.analysis.levels import LINE_LEVEL, REMAINDER_LEVEL
 from fusion.common import Array
-from fusion.results.loop import AxisLine, AxisStep
+from fusion.results.loop import AxisLine, AxisLoop, AxisStep, Coefficient, DeclaredCoefficient
+from fusion.results.parts import determined
 from interferometry.drift.kalman import DriftModelError
 
 # Other lines on the plan, another order of the targets or the other sign of the deviations, held against the declared
@@ -227,128 +227,137 @@ _LINES_SPAN = 0.1
 _BEYOND_SIGMAS = 3.0
 
 
-def _expansions(loop: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def _expansion(loop: AxisLoop) -> DeclaredCoefficient | None:
     """The declared expansion, where a coefficient is stated."""
-    declared = loop.get("declared_coefficients", [])
-    return [entry for entry in declared if entry["effect"] == "axis_expansion" and entry.get("prior") is not None]
+    declared = loop.declared_coefficients
+    return next((one for one in declared if one.effect == "axis_expansion" and one.prior is not None), None)
 
 
-def withhold_names(loop: Mapping[str, Any], effects: Mapping[str, Effect]) -> dict[str, Any]:
-    """The part ``loop`` of results.json without names that what stands beside them contradicts: of a course in time or a shape along the
-    axis where the expansion is not the stated one, of which it has taken, or left, a part; and of what is smaller than the structure left.
+def withhold_names(loop: AxisLoop, effects: Mapping[str, Effect]) -> AxisLoop:
+    """The closed loop without names that what stands beside them contradicts: of a course in time or a shape along the axis where the
+    expansion is not the stated one, of which it has taken, or left, a part; and of what is smaller than the structure left.
     """
-    stated, left = _expansions(loop), loop["unexplained"]
-    alone, alone_u, off = _asked_for(stated[0]) if stated else (0.0, 0.0, 0.0)
-    structure_um = left["rms_um"] if left["shape"] and left["p_value"] < REMAINDER_LEVEL else 0.0
+    stated, left = _expansion(loop), loop.unexplained
+    alone, alone_u, off = (0.0, 0.0, 0.0) if stated is None else _asked_for(stated)
+    has_structure = bool(left.shape) and determined(left.p_value) < REMAINDER_LEVEL
+    structure_um = determined(left.rms_um) if has_structure else 0.0
 
-    def why(step: Mapping[str, Any]) -> str:
-        effect = effects[step["effect"]]
+    def why(step: AxisStep) -> str:
+        effect, rms_um = effects[step.effect], determined(step.rms_um)
         if effect.like_expansion and math.isinf(alone_u):
             return say("withheld", "expansion_untold")
         if abs(off) > _LIMIT and (effect.excited_by or effect.like_expansion):
             return say("withheld", "expansion_contradicts", alone=alone, alone_u=alone_u)
-        if structure_um > step["rms_um"] and not {"time_s", "period_min"} & set(step["parameters"]):
-            return say("withheld", "less_than_is_left", rms_um=step["rms_um"], structure_um=structure_um)
+        if structure_um > rms_um and not {"time_s", "period_min"} & set(step.parameters):
+            return say("withheld", "less_than_is_left", rms_um=rms_um, structure_um=structure_um)
         return ""
 
-    steps = [{**step, "withheld": step["withheld"] or why(step)} for step in loop["steps"]]
-    named = any(AxisStep.model_construct(**step).keeps_name and not step["withheld"] for step in steps)
-    nameless = steps and not named and loop["verdict"] in ("explained", "partial")
-    return {**loop, "steps": steps, "verdict": "unexplained" if nameless else loop["verdict"]}
+    steps = tuple(step.model_copy(update={"withheld": step.withheld or why(step)}) for step in loop.steps)
+    named = any(step.keeps_name and not step.withheld for step in steps)
+    nameless = steps and not named and loop.verdict in ("explained", "partial")
+    return loop.model_copy(update={"steps": steps, "verdict": "unexplained" if nameless else loop.verdict})
 
 
-def _asked_for(entry: Mapping[str, Any]) -> tuple[float, float, float]:
+def _asked_for(entry: DeclaredCoefficient) -> tuple[float, float, float]:
     """Expansion that the readings alone ask for, its standard uncertainty, and standard deviations from the stated one."""
-    value, stated, stated_u = entry["value"], entry["prior"], entry["prior_u"]
-    u = entry["u"] if entry.get("u_fit") is None else entry["u_fit"]
-    weight = 1.0 / u**2 - 1.0 / stated_u**2
-    moved = _jackknife_u(entry)
+    stated, stated_u = determined(entry.prior), determined(entry.prior_u)
+    of_readings = 1.0 - entry.expected_share
     # The readings say nothing of their own where the fit is no better known than the statement.
-    if weight <= 0.0 or math.isinf(moved):
+    if of_readings <= 0.0 or math.isinf(entry.moved_u):
         alone, alone_u = stated, math.inf
     else:
-        alone = (value / u**2 - stated / stated_u**2) / weight
+        alone = (determined(entry.value) - entry.expected) / of_readings
         # The stated coefficient has diluted an error of the rise's scale as it has diluted the readings.
-        scale_u = (entry.get("u_scale") or 0.0) / (1.0 - u**2 / stated_u**2)
-        alone_u = math.hypot(math.sqrt(1.0 / weight), moved, scale_u)
+        fit_u, scale_u = entry.fitted_u / math.sqrt(of_readings), (entry.u_scale or 0.0) / of_readings
+        alone_u = math.hypot(fit_u, entry.moved_u, scale_u)
     return alone, alone_u, (alone - stated) / math.hypot(alone_u, stated_u)
 
 
 @check("loop", LOG, waits=True)
-def expansion_coefficient(loop: Mapping[str, Any]) -> Found | None:
+def expansion_coefficient(loop: AxisLoop) -> Found | None:
     """The coefficient that the readings ask for, the share of its lagged copies included, against the stated one: within `_LIMIT`
     standard deviations, and without `material_compensation` added, by itself or in a tie: it acts in proportion to the coefficient, and
     imitates a wrong one.
     """
-    stated = _expansions(loop)
-    if not stated:
+    stated = _expansion(loop)
+    if stated is None:
         return None
-    alone, alone_u, off = _asked_for(stated[0])
+    alone, alone_u, off = _asked_for(stated)
     # The compensation of the material may be what a wrong coefficient leaves.
-    absorbed = any("material_compensation" in (step["effect"], *step.get("tied", ())) for step in loop.get("steps", []))
-    facts = {"stated": stated[0]["prior"], "stated_u": stated[0]["prior_u"], "absorbed": absorbed}
-    passed = abs(off) <= _LIMIT and not absorbed
-    return judge(off, _LIMIT, passed=passed, alone=alone, alone_u=alone_u if math.isfinite(alone_u) else None, **facts)
-
-
-def _jackknife_u(entry: Mapping[str, Any]) -> float:
-    moved = entry.get("jackknife_u", 0.0)
-    return math.inf if moved is None else float(moved)
+    absorbed = any("material_compensation" in (step.effect, *step.tied) for step in loop.steps)
+    return judge(
+        off,
+        _LIMIT,
+        passed=abs(off) <= _LIMIT and not absorbed,
+        alone=alone,
+        alone_u=alone_u if math.isfinite(alone_u) else None,
+        stated=stated.prior,
+        stated_u=stated.prior_u,
+        absorbed=absorbed,
+    )
 
 
 @check("loop", LOG, waits=True)
-def sensitivity(loop: Mapping[str, Any], travel_mm: float) -> Found | None:
+def sensitivity(loop: AxisLoop, travel_mm: float) -> Found | None:
     """Every coefficient per kelvin, declared or added, less `_BEYOND_SIGMAS` standard deviations, against the largest one possible:
     `_LARGEST_PPM_PER_K` ppm/K along the axis, or 1.1 times the stated coefficient where that is larger (polymers), and that times the
     largest frame (`_FRAME_TRAVELS` travels, at least `_LEAST_FRAME_MM` mm) across it: at most 1.
     """
-    added = [{"effect": step["effect"], **entry} for step in loop.get("steps", []) for entry in step["coefficients"]]
-    coefficients = [*loop.get("declared_coefficients", []), *added]
+    declared: list[tuple[str, Coefficient]] = [(entry.effect, entry) for entry in loop.declared_coefficients]
+    coefficients = declared + [(step.effect, entry) for step in loop.steps for entry in step.coefficients]
     frame_mm = max(_FRAME_TRAVELS * travel_mm, _LEAST_FRAME_MM)
-    stated = [entry["prior"] for entry in coefficients if entry["unit"] == "ppm/K" and entry.get("prior") is not None]
+    stated = [entry.prior for _, entry in coefficients if entry.unit == "ppm/K" and entry.prior is not None]
     ppm_per_K = max([_LARGEST_PPM_PER_K, *(1.1 * value for value in stated)])
     largest = {"ppm/K": ppm_per_K, "um/K": ppm_per_K * frame_mm * 1e-3}
 
-    def share_of(entry: Mapping[str, Any]) -> float:
-        size = abs(entry["value"]) - _BEYOND_SIGMAS * math.hypot(entry["u"], _jackknife_u(entry))
-        return float(size / largest[entry["unit"]])
+    def share_of(entry: Coefficient) -> float:
+        size = abs(determined(entry.value)) - _BEYOND_SIGMAS * math.hypot(determined(entry.u), entry.moved_u)
+        return size / largest[entry.unit]
 
-    compared = [entry for entry in coefficients if entry["unit"] in largest]
+    compared = [(share_of(entry), effect, entry) for effect, entry in coefficients if entry.unit in largest]
     if not compared:
         return None
-    entry = max(compared, key=share_of)
-    facts = {"entry": entry, "largest": largest[entry["unit"]], "frame_m": frame_mm * 1e-3}
-    return judge(max(share_of(entry), 0.0), 1.0, **facts)
+    share, effect, entry = max(compared, key=lambda one: one[0])
+    reach = largest[entry.unit]
+    return judge(max(share, 0.0), 1.0, effect=effect, entry=entry, largest=reach, frame_m=frame_mm * 1e-3)
 
 
 @check("loop", CLOCK, waits=True)
-def axis_line(loop: Mapping[str, Any]) -> Found | None:
+def axis_line(loop: AxisLoop) -> Found | None:
     """Log-likelihood that the best other line on the plan, order of the targets or sign of the deviations gains: at most what is gained
     by chance in `LINE_LEVEL` of `_DRAWS` simulated tests with the declared line, at least ln 500 = 6.2; `_LINE_GAIN_OVER_CAUSE` where it
     makes a named cause superfluous, which was chosen among as many.
     """
-    line = loop.get("axis_line")
+    line = loop.axis_line
     if line is None:
         return None
-    limit = _LINE_GAIN_OVER_CAUSE if line["superfluous"] else line["gain_limit"]
+    limit = _LINE_GAIN_OVER_CAUSE if line.superfluous else determined(line.gain_limit)
     # An effect that is significant but has no name yet is worth about -ln p; a line that explains less is no better explanation.
-    unconfirmed = loop.get("unconfirmed_effects", {}).values()
+    unconfirmed = map(determined, loop.unconfirmed_effects.values())
     limit = max(limit, *(-math.log(max(p, sys.float_info.min)) for p in unconfirmed), 0.0)
-    return judge(line["gain"], limit, verified=not lines_differ(line), line=line)
+    return judge(determined(line.gain), limit, verified=not lines_differ(line), line=line)
 
 
-def lines_differ(line: Mapping[str, Any]) -> bool:
+def lines_differ(line: AxisLine) -> bool:
     """Whether lines that explain the readings as well as the declared one ask for expansions that differ."""
-    low, high = line["alternative_ppm_per_K"]
-    return bool(high - low > _LINES_SPAN * max(abs(low), abs(high)))
+    low, high = map(determined, line.alternative_ppm_per_K)
+    return high - low > _LINES_SPAN * max(abs(low), abs(high))
 
 
-def with_line(entry: Mapping[str, Any], line: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the declared expansion with what the choice of the line adds to its uncertainty (rectangular, JCGM 100:2008, 4.3.7)."""
-    if line is None or entry["effect"] != "axis_expansion" or not lines_differ(line):
-        return dict(entry)
-    # The expansion that was expected takes part along every line.
-    share = 0.0 if entry.get("prior") is None else entry["u_fit"] ** 2 / entry["prior_u"] ** 2
-    along = [(1.0 - share) * value + share * (entry.get("prior") or 0.0) for value in line["alternative_ppm_per_K"]]
-    u_line = max(abs(value - entry["value"]) for value in along) / math.sqrt(3.0)
-    return {**entry, "u": math.hypot(entry["u"], u_line), "u_line": u_line}
+def with_line(loop: AxisLoop) -> AxisLoop:
+    """Return the closed loop with what the choice of the line adds to the uncertainty of the declared expansion (rectangular,
+    JCGM 100:2008, 4.3.7).
+    """
+    line = loop.axis_line
+    if line is None or not lines_differ(line):
+        return loop
+
+    def completed(entry: DeclaredCoefficient) -> DeclaredCoefficient:
+        if entry.effect != "axis_expansion":
+            return entry
+        # The expansion that was expected takes part along every line.
+        others = ((1.0 - entry.expected_share) * determined(one) + entry.expected for one in line.alternative_ppm_per_K)
+        u_line = max(abs(other - determined(entry.value)) for other in others) / math.sqrt(3.0)
+        return entry.model_copy(update={"u": math.hypot(determined(entry.u), u_line), "u_line": u_line})
+
+    return loop.model_copy(update={"declared_coefficients": tuple(map(completed, loop.declared_coefficients))})

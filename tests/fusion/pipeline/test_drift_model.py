@@ -39,6 +39,10 @@ from fusion.pipeline.drift_model import (
     with_event_times,
     with_spread,
 )
+from fusion.results.axis import AnomalyPart, Evidence
+from fusion.results.loop import DeclaredCoefficient, ResidualDrift
+from fusion.results.parts import Sensitivity
+from tests.fusion import loops
 from tests.fusion.small_campaign import campaign, logged, model_of, term
 
 DIMS = ("cycle", "direction", "target")
@@ -192,8 +196,8 @@ def test_an_event_has_the_time_of_day_of_its_instant():
     fused["deviation"][0, 0, 0] = np.nan
     added = [SimpleNamespace(candidate=SimpleNamespace(event_s=at)) for at in (600.4, None)]
     result = SimpleNamespace(state=SimpleNamespace(added=added))
-    steps = with_event_times([{"effect": "step_event"}, {"effect": "thermal_lag"}], result, fused)
-    assert [step["event_time"] for step in steps] == ["2026-03-09T06:41:02Z", None]
+    steps = with_event_times([loops.added("step_event"), loops.added("thermal_lag")], result, fused)
+    assert [step.event_time for step in steps] == ["2026-03-09T06:41:02Z", None]
 
 
 def test_the_errors_that_the_loop_reports_are_kept_reading_by_reading():
@@ -281,8 +285,8 @@ def test_scales_are_weighted_by_the_rise_and_both_parts_are_combined():
     assert plan_scale_u(creeps) == pytest.approx(
         np.hypot(plan_scale_u(fields()), 0.2 / float(fields()["temperature_rise"][1].mean()))
     )
-    both = scaled({"value": -10.0, "u": 0.3}, 0.04)
-    assert (both["u_fit"], both["u_scale"], both["u"]) == pytest.approx((0.3, 0.4, 0.5))
+    both = scaled(Sensitivity(value=-10.0, u=0.3), 0.04)
+    assert (both.u_fit, both.u_scale, both.u) == pytest.approx((0.3, 0.4, 0.5))
 
 
 def test_what_was_expected_does_not_depend_on_the_rise():
@@ -294,43 +298,38 @@ def test_what_was_expected_does_not_depend_on_the_rise():
         return float(np.average([readings, expected], weights=weights))
 
     u = (alone_u**-2 + expected_u**-2) ** -0.5
-    entry = {"value": mean(alone), "u": u, "prior": expected, "prior_u": expected_u}
-    assert scaled(entry, 0.01)["u_scale"] == pytest.approx(abs(mean(alone * 1.01) - mean(alone)))
-    declared = [{**scaled(entry, 0.1), "effect": "axis_expansion", "unit": "ppm/K"}]
-    (check,) = run_checks("loop", Inputs(loop={"declared_coefficients": declared}))
+    entry = loops.declared_one("axis_expansion", mean(alone), u, prior=expected, prior_u=expected_u)
+    assert scaled(entry, 0.01).u_scale == pytest.approx(abs(mean(alone * 1.01) - mean(alone)))
+    (check,) = run_checks("loop", Inputs(loop=loops.loop(scaled(entry, 0.1))))
     # 10 against 12: with 1 of the readings, 10 % of 10 of the scale, and 2 of the expectation.
     assert check.value == pytest.approx(-2.0 / np.sqrt(1.0 + 1.0 + 4.0))
 
 
 def test_only_coefficients_per_kelvin_of_the_rise_are_scaled():
-    one = {"value": 2.0, "u": 0.1}
-    loop = {
-        "declared_coefficients": [
-            {"effect": "axis_expansion", "unit": "ppm/K", **one},
-            {"effect": "table_offset", "unit": "um/K", **one},
-            {"effect": "material_compensation", "unit": "ppm/K", **one},
-        ],
-        "steps": [
-            {"effect": "angular_growth", "parameters": {"follows": "mean_rise"}, "coefficients": [{"unit": "um/(K)", **one}]},
-            {"effect": "step_event", "parameters": {"time_s": 3.0}, "coefficients": [{"unit": "um", **one}]},
-        ],
-    }  # fmt: skip
-    before = json.dumps(loop)
+    loop = loops.loop(
+        loops.declared_one("axis_expansion", 2.0, 0.1),
+        loops.declared_one("table_offset", 2.0, 0.1, "um/K"),
+        loops.declared_one("material_compensation", 2.0, 0.1),
+        steps=(
+            loops.added("angular_growth", loops.coefficient(2.0, 0.1, "um/(K)"), parameters={"follows": "mean_rise"}),
+            loops.added("step_event", loops.coefficient(2.0, 0.1, "um"), parameters={"time_s": 3.0}),
+        ),
+    )
     done = scale_coefficients(loop, library(), axis_u=0.02, plan_u=0.03)
-    assert [entry.get("u_scale") for entry in done["declared_coefficients"]] == [0.04, 0.06, None]
-    assert [step["coefficients"][0].get("u_scale") for step in done["steps"]] == [0.06, None]
-    assert json.dumps(loop) == before
+    assert [entry.u_scale for entry in done.declared_coefficients] == [0.04, 0.06, None]
+    assert [step.coefficients[0].u_scale for step in done.steps] == [0.06, None]
 
 
 def test_the_local_temperature_of_an_anomaly_carries_the_scale_of_its_place():
     position = xr.DataArray([0.0, 200.0], dims="target", coords={"target": [1, 2]})
     axis = AxisGeometry((20.0, 30.0), (1.0, 0.0))
-    anomaly = {"target": 2, "evidence": {"temperature_um_per_K": 2.0, "temperature_u_um_per_K": 0.1}}
-    evidence = scale_evidence(anomaly, axis, fields(), position)["evidence"]
-    assert evidence["temperature_scale_u_um_per_K"] == pytest.approx(0.1)
-    assert evidence["temperature_u_um_per_K"] == pytest.approx(0.1 * np.sqrt(2.0))
-    without = {"target": 2, "evidence": {}}
-    assert scale_evidence(without, axis, fields(), position) is without
+    known = Evidence.model_construct(temperature_um_per_K=2.0, temperature_u_um_per_K=0.1)
+    evidence = scale_evidence(AnomalyPart.model_construct(target=2, evidence=known), axis, fields(), position).evidence
+    assert evidence.temperature_scale_u_um_per_K == pytest.approx(0.1)
+    assert evidence.temperature_u_um_per_K == pytest.approx(0.1 * np.sqrt(2.0))
+    for number in (None, np.nan):
+        without = AnomalyPart.model_construct(target=2, evidence=Evidence.model_construct(temperature_um_per_K=number))
+        assert scale_evidence(without, axis, fields(), position) is without
 
 
 def test_results_carry_both_parts_of_every_coefficient(results_folder):
@@ -352,7 +351,7 @@ def test_a_zero_that_may_swing_hides_what_is_left_as_drift_in_its_share_of_the_r
     rise = np.array([0.0, 1.0, 2.0, 3.0])[:, None, None] * np.ones((1, 2, 2))
     coords = {"cycle": np.arange(1, 5), "y": [0.0, 10.0], "x": [0.0, 10.0]}
     fields = xr.Dataset({"temperature_rise": (("cycle", "y", "x"), rise)}, coords=coords)
-    left = {"residual_drift": {"common_rms_um": 0.8, "stretch_rms_um": 0.6}}
+    left = ResidualDrift.model_construct(common_rms_um=0.8, stretch_rms_um=0.6)
     position = np.array([0.0, 100.0, 200.0])
     assert hidden_by_zero(left, fields, position) == {"um/K": 0.0, "ppm/K": 0.0}
     unsure = fields.assign(camera_correction_u=("cycle", [0.0, 0.5, 1.0, 1.5]))
@@ -361,8 +360,8 @@ def test_a_zero_that_may_swing_hides_what_is_left_as_drift_in_its_share_of_the_r
     # Half of the rise is the zero's: half of the drift per kelvin, and per kelvin and metre.
     assert hidden["um/K"] == pytest.approx(0.5 * 0.8 / swing)
     assert hidden["ppm/K"] == pytest.approx(0.5 * 0.6 / (reach * swing))
-    entry = scaled({"value": 0.02, "u": 0.1}, 0.5, hidden["um/K"])
-    assert entry["u"] == pytest.approx(np.sqrt(0.1**2 + 0.01**2 + hidden["um/K"] ** 2)) and entry["u_fit"] == 0.1
+    entry = scaled(Sensitivity(value=0.02, u=0.1), 0.5, hidden["um/K"])
+    assert entry.u == pytest.approx(np.sqrt(0.1**2 + 0.01**2 + hidden["um/K"] ** 2)) and entry.u_fit == 0.1
 
 
 @pytest.mark.parametrize(
@@ -379,4 +378,6 @@ def test_a_zero_that_may_swing_hides_what_is_left_as_drift_in_its_share_of_the_r
     ],
 )
 def test_a_declared_coefficient_is_no_surer_than_parts_of_the_test_agree(given, u):
-    assert with_spread(given)["u"] == pytest.approx(u)
+    assert with_spread(
+        DeclaredCoefficient(effect="axis_expansion", value=1.0, unit="ppm/K", **given)
+    ).u == pytest.approx(u)

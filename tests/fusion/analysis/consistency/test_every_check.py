@@ -18,7 +18,8 @@ from fusion.analysis.consistency.clocks import Recording, compare_clocks
 from fusion.analysis.consistency.series import Motion, field_at, log_with_camera, thin_fields
 from fusion.pipeline.consistency import Check, _worded, run_checks
 from fusion.results.axis import RegistrationPart
-from tests.fusion.analysis.consistency import test_camera, test_deviations, test_logs, test_model
+from tests.fusion import loops
+from tests.fusion.analysis.consistency import test_camera, test_deviations, test_logs
 from tests.fusion.analysis.consistency.twin_fields import FILES, SENSOR_MM, late, recorded, scaled
 from tests.soak.lies.logs import starts
 from thermography.inspection import FileWarning
@@ -177,23 +178,9 @@ def clocks(*names: str) -> Inputs:
     return Inputs(clocks=compare_clocks(recordings, []))
 
 
-def lines(**changed: Any) -> dict[str, Any]:
-    return {
-        "alternative": "with deviations of the opposite sign",
-        "gain": 3.0,
-        "gain_limit": 8.0,
-        "alternative_ppm_per_K": (11.2, 11.6),
-        "expansion_ppm_per_K": 11.5,
-        "expansion_u_ppm_per_K": 0.2,
-        "superfluous": (),
-        **changed,
-    }
-
-
 def loop(alone: float = 11.5, offset: float = 1.0, **line: Any) -> Lie:
-    found = test_model.declared(alone, 0.2)
-    found["declared_coefficients"][0]["value"] = offset
-    return other(loop=found | {"axis_line": lines(**line)})
+    found = loops.declared(alone, 0.2, offset=offset)
+    return other(loop=loops.loop(*found, axis_line=loops.line(**line)))
 
 
 #: One lie for each check.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,8 @@ from fusion.analysis.drift_model.axis import declare
 from fusion.analysis.drift_model.model import Term, fit_model
 from fusion.analysis.effects.library import library
 from fusion.pipeline.consistency import Check, run_checks
-from fusion.results.loop import AxisLine
+from fusion.results.loop import AxisLine, AxisLoop, AxisUnexplained
+from tests.fusion.loops import added, coefficient, declared, declared_one, line, loop
 from tests.fusion.small_campaign import term
 
 START = np.datetime64("2026-03-09T08:00", "ns")
@@ -63,9 +63,7 @@ def compared(fused: xr.Dataset, fields: xr.Dataset, declared: AxisGeometry, *add
 
 def doubted(comparison: AxisLine) -> bool:
     (check,) = (
-        check
-        for check in run_checks("loop", Inputs(loop={"axis_line": comparison.model_dump()}))
-        if check.code == "axis_line"
+        check for check in run_checks("loop", Inputs(loop=loop(axis_line=comparison))) if check.code == "axis_line"
     )
     assert check.value == comparison.gain
     return not check.passed
@@ -149,17 +147,8 @@ def test_rows_are_interpolated_between_their_places_and_at_both_ends() -> None:
 # The fitted coefficients against the stated one and against what expansion can do, with the statement's own part taken out of the fit.
 
 
-def declared(alone: float, alone_u: float, *, moved: float | None = 0.0, stated_u: float = 2.0) -> dict[str, object]:
-    """The part of a loop in which readings that ask for `alone` met the statement of 11.7 ppm/K."""
-    weight = 1.0 / alone_u**2 + 1.0 / stated_u**2
-    value = (alone / alone_u**2 + 11.7 / stated_u**2) / weight
-    offset = {"effect": "table_offset", "value": 1.0, "u": 0.1, "unit": "um/K", "jackknife_u": 0.2}
-    axis = {"effect": "axis_expansion", "value": value, "u": weight**-0.5, "unit": "ppm/K", "jackknife_u": moved}
-    return {"declared_coefficients": [offset, {**axis, "prior": 11.7, "prior_u": stated_u}], "steps": []}
-
-
-def by_code(loop: dict[str, object], travel_mm: float = 300.0) -> dict[str, Check]:
-    return {check.code: check for check in run_checks("loop", Inputs(loop=loop, travel_mm=travel_mm))}
+def by_code(found: AxisLoop, travel_mm: float = 300.0) -> dict[str, Check]:
+    return {check.code: check for check in run_checks("loop", Inputs(loop=found, travel_mm=travel_mm))}
 
 
 @pytest.mark.parametrize(
@@ -178,7 +167,7 @@ def by_code(loop: dict[str, object], travel_mm: float = 300.0) -> dict[str, Chec
 def test_readings_that_contradict_the_statement_are_doubted(
     alone: float, alone_u: float, moved: float, passed: bool
 ) -> None:
-    check = by_code(declared(alone, alone_u, moved=moved))["expansion_coefficient"]
+    check = by_code(loop(*declared(alone, alone_u, moved=moved)))["expansion_coefficient"]
     # The statement's part is taken out exactly.
     assert check.value == pytest.approx((alone - 11.7) / np.sqrt(alone_u**2 + moved**2 + 4.0), rel=1e-6)
     assert check.passed is passed
@@ -187,7 +176,7 @@ def test_readings_that_contradict_the_statement_are_doubted(
 
 @pytest.mark.parametrize("moved", [None, math.inf])
 def test_a_coefficient_that_rests_on_one_target_alone_contradicts_nothing(moved: float | None) -> None:
-    check = by_code(declared(40.0, 0.1, moved=moved))["expansion_coefficient"]
+    check = by_code(loop(*declared(40.0, 0.1, moved=moved)))["expansion_coefficient"]
     assert check.passed and check.value == 0.0 and "do not determine" in check.evidence
 
 
@@ -195,43 +184,38 @@ def test_a_coefficient_that_rests_on_one_target_alone_contradicts_nothing(moved:
     ("effect", "tied"), [("material_compensation", ()), ("thermal_lag", ("material_compensation",))]
 )
 def test_an_added_error_of_the_compensation_may_be_a_wrong_coefficient(effect: str, tied: tuple[str, ...]) -> None:
-    step = {"effect": effect, "tied": tied, "coefficients": []}
-    check = by_code({**declared(11.5, 0.2), "steps": [step]})["expansion_coefficient"]
+    stated = declared(11.5, 0.2)
+    check = by_code(loop(*stated, steps=(added(effect, tied=tied),)))["expansion_coefficient"]
     assert not check.passed and check.evidence.endswith("which a wrong coefficient imitates.")
-    other = {**step, "tied": (), "effect": "dead_path"}
-    assert by_code({**declared(11.5, 0.2), "steps": [other]})["expansion_coefficient"].passed
+    assert by_code(loop(*stated, steps=(added("dead_path"),)))["expansion_coefficient"].passed
 
 
 def test_readings_that_say_nothing_contradict_nothing() -> None:
-    entry = {"effect": "axis_expansion", "value": 11.7, "u": 2.0, "prior": 11.7, "prior_u": 2.0, "unit": "ppm/K"}
-    check = by_code({"declared_coefficients": [entry]})["expansion_coefficient"]
+    check = by_code(loop(declared_one("axis_expansion", 11.7, 2.0, prior=11.7, prior_u=2.0)))["expansion_coefficient"]
     assert check.passed and check.value == 0.0
 
 
 def test_without_a_declared_expansion_there_is_no_statement_to_contradict() -> None:
-    loop = {"declared_coefficients": [{"effect": "table_offset", "value": 1.0, "u": 0.1, "unit": "um/K"}]}
-    assert list(by_code(loop)) == ["sensitivity"]
-    assert by_code({"declared_coefficients": []}) == {}
+    assert list(by_code(loop(declared_one("table_offset", 1.0, 0.1, "um/K")))) == ["sensitivity"]
+    assert by_code(loop()) == {}
 
 
 def test_no_frame_moves_further_than_it_expands() -> None:
     # A frame of 3 m of 26 ppm/K moves by 78 um/K; five travels of 2 m by 260.
-    loop = {"declared_coefficients": [{"effect": "table_offset", "value": -100.0, "u": 5.0, "unit": "um/K"}]}
-    doubted = by_code(loop)["sensitivity"]
+    found = loop(declared_one("table_offset", -100.0, 5.0, "um/K"))
+    doubted = by_code(found)["sensitivity"]
     assert not doubted.passed and doubted.value == pytest.approx((100.0 - 15.0) / 78.0)
     assert "table offset has -100 µm/K" in doubted.evidence and doubted.remedy
-    assert by_code(loop, travel_mm=2000.0)["sensitivity"].passed
+    assert by_code(found, travel_mm=2000.0)["sensitivity"].passed
 
 
 def test_a_stage_of_polymer_may_expand_as_it_is_stated() -> None:
-    entry = {"effect": "axis_expansion", "value": 92.0, "u": 2.0, "prior": 90.0, "prior_u": 5.0, "unit": "ppm/K"}
-    assert by_code({"declared_coefficients": [entry]})["sensitivity"].passed
+    assert by_code(loop(declared_one("axis_expansion", 92.0, 2.0, prior=90.0, prior_u=5.0)))["sensitivity"].passed
 
 
 def test_the_coefficients_of_added_effects_are_held_against_physics_as_well() -> None:
-    lag = {"value": 60.0, "u": 2.0, "unit": "ppm/K"}
-    loop = {**declared(11.5, 0.2), "steps": [{"effect": "thermal_lag", "coefficients": [lag]}]}
-    check = by_code(loop)["sensitivity"]
+    found = loop(*declared(11.5, 0.2), steps=(added("thermal_lag", coefficient(60.0, 2.0)),))
+    check = by_code(found)["sensitivity"]
     assert not check.passed and check.evidence.startswith("thermal lag has 60 ppm/K")
 
 
@@ -248,18 +232,15 @@ def test_the_coefficients_of_added_effects_are_held_against_physics_as_well() ->
 def test_a_line_that_does_away_with_a_named_cause_needs_less(
     gain: float, superfluous: tuple[str, ...], passed: bool
 ) -> None:
-    line = {
-        "alternative": "along a line that runs the other way round from x 200 mm, y 90 mm",
-        "gain": gain,
-        "gain_limit": 8.0,
-        "alternative_ppm_per_K": (11.2, 12.6),
-        "expansion_ppm_per_K": 11.5,
-        "expansion_u_ppm_per_K": 0.2,
-        "superfluous": superfluous,
-    }
-    check = by_code({"axis_line": line})["axis_line"]
+    other = line(
+        alternative="along a line that runs the other way round from x 200 mm, y 90 mm",
+        gain=gain,
+        alternative_ppm_per_K=(11.2, 12.6),
+        superfluous=superfluous,
+    )
+    check = by_code(loop(axis_line=other))["axis_line"]
     assert check.passed is passed
-    assert by_code({"axis_line": line, "unconfirmed_effects": {"pitch_error": 1e-17}})["axis_line"].passed
+    assert by_code(loop(axis_line=other, unconfirmed_effects={"pitch_error": 1e-17}))["axis_line"].passed
     assert ("indicate 11.2 to 12.6 ppm/K" in check.evidence) is passed
     assert (f"(log-likelihood {gain:+.1f}" in check.evidence) is (gain > 0.0)
     assert ("without angular growth" in check.evidence) is (bool(superfluous) and not passed)
@@ -268,45 +249,39 @@ def test_a_line_that_does_away_with_a_named_cause_needs_less(
 
 
 def test_lines_that_fit_as_well_are_part_of_the_uncertainty_of_the_expansion() -> None:
-    entry = {"effect": "axis_expansion", "value": 16.0, "u": 0.5, "u_fit": 0.4, "prior": 11.7, "prior_u": 2.0}
-    far, near = {"alternative_ppm_per_K": (11.0, 16.2)}, {"alternative_ppm_per_K": (15.0, 16.2)}
+    entry = declared_one("axis_expansion", 16.0, 0.5, u_fit=0.4, prior=11.7, prior_u=2.0)
+    offset = declared_one("table_offset", 16.0, 0.5, "um/K", u_fit=0.4)
     # The readings alone ask for 11 ppm/K along the other line, and with the one that was expected for a little more.
     u_line = (16.0 - (0.96 * 11.0 + 0.04 * 11.7)) / math.sqrt(3.0)
-    assert with_line(entry, far) == {
-        **entry,
-        "u": pytest.approx(math.hypot(0.5, u_line)),
-        "u_line": pytest.approx(u_line),
-    }
-    assert with_line(entry, near) == with_line(entry, None) == entry
-    assert with_line({**entry, "effect": "table_offset"}, far)["u"] == 0.5
+    far, beside = with_line(
+        loop(entry, offset, axis_line=line(alternative_ppm_per_K=(11.0, 16.2)))
+    ).declared_coefficients
+    assert (far.u, far.u_line) == pytest.approx((math.hypot(0.5, u_line), u_line))
+    assert far.model_copy(update={"u": 0.5, "u_line": None}) == entry and beside == offset
+    for same in (loop(entry, axis_line=line(alternative_ppm_per_K=(15.0, 16.2))), loop(entry)):
+        assert with_line(same) is same
 
 
 def test_a_shape_along_the_axis_is_withheld_where_the_expansion_beside_it_is_not_told() -> None:
-    loop = withhold_names(loop_with("unseen_heat_source", "pitch_error", **declared(11.5, math.inf)), library())
-    assert [bool(step["withheld"]) for step in loop["steps"]] == [False, True]
+    steps = (added("unseen_heat_source"), added("pitch_error"))
+    found = withhold_names(loop(*declared(11.5, math.inf), steps=steps), library())
+    assert [bool(step.withheld) for step in found.steps] == [False, True]
 
 
 @pytest.mark.parametrize(("value", "withheld"), [(11.5, False), (2.1, True)])
 def test_names_of_courses_and_shapes_are_withheld_where_the_expansion_contradicts(value: float, withheld: bool) -> None:
-    names = ("unseen_heat_source", "angular_growth", "dead_path")
-    loop = withhold_names(loop_with(*names, **declared(value, 0.2)), library())
-    assert [bool(step["withheld"]) for step in loop["steps"]] == [withheld, withheld, False]
-    assert loop["verdict"] == "partial"
+    steps = (added("unseen_heat_source"), added("angular_growth"), added("dead_path"))
+    found = withhold_names(loop(*declared(value, 0.2), steps=steps), library())
+    assert [bool(step.withheld) for step in found.steps] == [withheld, withheld, False]
+    assert found.verdict == "partial"
 
 
 @pytest.mark.parametrize(
     ("p_value", "rms_um", "verdict"), [(0.001, 0.4, "unexplained"), (0.001, 0.2, "partial"), (0.5, 0.4, "partial")]
 )
 def test_a_name_is_withheld_beside_structure_that_is_larger(p_value: float, rms_um: float, verdict: str) -> None:
-    left = {"shape": "one step; targets 3, 5", "rms_um": rms_um, "p_value": p_value}
-    loop = withhold_names(loop_with("dead_path", unexplained=left), library())
-    assert loop["verdict"] == verdict and bool(loop["steps"][0]["withheld"]) == (verdict == "unexplained")
-    loop["steps"][0].update(withheld="", parameters={"time_s": 60.0})
-    assert not withhold_names(loop, library())["steps"][0]["withheld"]
-
-
-def loop_with(*names: str, **parts: Any) -> dict[str, Any]:
-    step = {"withheld": "", "coefficients": [], "parameters": {}, "rms_um": 0.3, "borne_out": "yes"}
-    nothing = {"shape": "", "rms_um": 0.0, "p_value": 0.5}
-    steps = [{"effect": name, **step} for name in names]
-    return {"unexplained": nothing, "verdict": "partial", **parts, "steps": steps}
+    left = AxisUnexplained.model_construct(shape="one step; targets 3, 5", rms_um=rms_um, p_value=p_value)
+    found = withhold_names(loop(unexplained=left, steps=(added("dead_path"),)), library())
+    assert found.verdict == verdict and bool(found.steps[0].withheld) == (verdict == "unexplained")
+    event = added("dead_path", parameters={"time_s": 60.0})
+    assert not withhold_names(loop(unexplained=left, steps=(event,)), library()).steps[0].withheld
