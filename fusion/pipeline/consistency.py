@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -65,44 +66,45 @@ def check_source(source: Read) -> list[Check]:
         raise CampaignError(
             f"{source.campaign.path}: accept.doubts = {unknown[0]!r}: no such check; there are: {', '.join(RULES)}"
         )
-    motion, inputs = _motion(source), dict[str, Any]()
+    motion, inputs = _motion(source), Inputs()
     if isinstance(source, LaserInputs):
-        inputs = _of_logs(source) | _of_readings(source)
+        inputs = _with_readings(_logs_of(source), source)
     if isinstance(source, CameraInputs) and source.frames:
         stated, stack = set(overridden_parameters(source.thermography)), source.thermography.stack
         # Temperatures whose emissivity is not stated are taken as they are: a notice of its own, and no doubt about a stored value.
         if isinstance(source.frames[0], TemperatureFrame) and (stack is None or stack.emissivity is None):
             stated.add("emissivity")
-        inputs |= {"frames": source.frames, "file_warnings": file_warnings(source.frames, overridden=stated)}
+        inputs = replace(inputs, frames=source.frames, file_warnings=file_warnings(source.frames, overridden=stated))
         if isinstance(source, Source):
             offset_s = source.thermography.clock_offset_s or 0.0
-            inputs |= {"frame_time": _frame_times(source), "motion": motion, "offset_s": offset_s}
-    return [*run_checks("source", Inputs(**inputs)), *_check_clocks(source, compare_phase(motion))]
+            inputs = replace(inputs, frame_time=_frame_times(source), motion=motion, offset_s=offset_s)
+    return [*run_checks("source", inputs), *_check_clocks(source, compare_phase(motion))]
 
 
-def _of_logs(source: Read) -> dict[str, Any]:
+def _logs_of(source: Read) -> Inputs:
     """Logs with the names of their files, and whether the readings were compensated with one."""
     laser, drivers = source.campaign.interferometry, source.campaign.drivers
-    return {
-        "environment": source.environment,
-        "environment_file": (None if laser is None else laser.environment) or "the environment log",
-        "drivers": source.drivers,
-        "drivers_file": "the drivers' log" if drivers is None else drivers.file,
-        "recompensated": isinstance(source, LaserInputs) and source.interferometry.recompensates,
-    }
+    return Inputs(
+        environment=source.environment,
+        environment_file=(None if laser is None else laser.environment) or "the environment log",
+        drivers=source.drivers,
+        drivers_file="the drivers' log" if drivers is None else drivers.file,
+        recompensated=isinstance(source, LaserInputs) and source.interferometry.recompensates,
+    )
 
 
-def _of_readings(source: LaserInputs) -> dict[str, Any]:
-    """Readings, and logs that stand beside them."""
+def _with_readings(inputs: Inputs, source: LaserInputs) -> Inputs:
+    """Add readings, and logs that stand beside them."""
     deviations, plan, sensors = source.deviations, source.campaign.plan, source.sensors
-    inputs: dict[str, Any] = {"deviations": deviations, "reading_time": deviations["time"]}
+    inputs = replace(inputs, deviations=deviations, reading_time=deviations["time"])
     if not is_rotary(deviations) and np.isfinite(deviations["deviation"].values).any():
-        inputs["linear"] = deviations
+        inputs = replace(inputs, linear=deviations)
     if plan is not None and plan.axis is not None and plan.size_mm is not None:
         extent = (abs(part) * length for part, length in zip(plan.axis.direction, plan.size_mm, strict=True))
-        inputs["plan_extent_mm"] = sum(extent)
+        inputs = replace(inputs, plan_extent_mm=sum(extent))
     if sensors is not None and not isinstance(source, CameraInputs):
-        inputs |= {"sensors": sensors.temperature.to_dataset(name="temperature"), "sensors_file": sensors.file}
+        logged = sensors.temperature.to_dataset(name="temperature")
+        inputs = replace(inputs, sensors=logged, sensors_file=sensors.file)
     return inputs
 
 
@@ -123,7 +125,7 @@ def _motion(source: Read, fields: xr.Dataset | None = None) -> Motion | None:
 def _check_clocks(source: Read, compared: Sequence[Evidence], fields: xr.Dataset | None = None) -> list[Check]:
     """Check the clocks of all recordings; the frames on the clock of the fields, where those are known."""
     found = compare_clocks(_recordings(source, fields), compared)
-    return run_checks("clocks", Inputs(**_of_logs(source), clocks=found))
+    return run_checks("clocks", replace(_logs_of(source), clocks=found))
 
 
 def _recordings(source: Read, fields: xr.Dataset | None = None) -> list[Recording]:
@@ -151,8 +153,8 @@ def _recordings(source: Read, fields: xr.Dataset | None = None) -> list[Recordin
 
 def check_fields(source: CameraInputs, fields: xr.Dataset, fused: xr.Dataset | None = None) -> list[Check]:
     """Check the fields in themselves and against logs and contact sensors; with a laser against material temperature and drift too."""
-    inputs, field, on_plan = _of_logs(source), thin_fields(fields), source.sensors
-    inputs |= {"fields": fields, "field": field}
+    field, on_plan = thin_fields(fields), source.sensors
+    inputs = replace(_logs_of(source), fields=fields, field=field)
     compared = list[Evidence]()
     if isinstance(source, Source) and fused is not None:
         # It takes three cycles at three targets with readings among the frames.
@@ -161,13 +163,23 @@ def check_fields(source: CameraInputs, fields: xr.Dataset, fused: xr.Dataset | N
         place_mm = source.interferometry.material_sensor_mm
         near = field if place_mm is None else field_at(fields, place_mm)
         compared += [*compare_phase(_motion(source, fields)), *compare_material(near, source.environment)]
-        inputs |= {"logged": log_with_camera(near, source.environment), "place_stated": place_mm is not None}
-        inputs |= {"frame_time": fields["time"].values, "reading_time": source.deviations["time"]}
+        inputs = replace(
+            inputs,
+            logged=log_with_camera(near, source.environment),
+            place_stated=place_mm is not None,
+            frame_time=fields["time"].values,
+            reading_time=source.deviations["time"],
+        )
     if on_plan is not None:
-        inputs |= {"sensor_temperature": on_plan.temperature, "sensor_u_K": on_plan.u_K}
-        inputs |= {"sensor_x_mm": on_plan.x_mm, "sensor_y_mm": on_plan.y_mm}
+        inputs = replace(
+            inputs,
+            sensor_temperature=on_plan.temperature,
+            sensor_u_K=on_plan.u_K,
+            sensor_x_mm=on_plan.x_mm,
+            sensor_y_mm=on_plan.y_mm,
+        )
     clocks = _check_clocks(source, [*compared, *compare_load(field, source.drivers)], fields)
-    return [*clocks, *_together(run_checks("fields", Inputs(**inputs)))]
+    return [*clocks, *_together(run_checks("fields", inputs))]
 
 
 def _together(checks: Sequence[Check]) -> Iterator[Check]:
