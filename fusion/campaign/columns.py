@@ -93,8 +93,12 @@ _LENGTHS_S = np.array([1800.0, 1e7])
 _WORDS = tuple((one["name"], frozenset(one["words"])) for one in _VOCABULARY["role"])
 #: Words of a column that counts, and of one that says nothing of what it holds, where no other word stands beside them.
 _COUNTING, _SAYING_NOTHING = frozenset(_VOCABULARY["counting"]), frozenset(_VOCABULARY["saying_nothing"])
+#: Letters of a word by which a longer one that ends with it is known.
+_SHORTEST_ENDING = 4
 #: Most columns of a table with a line for every change: date, time, channel, value, unit, quality.
 _WIDEST_LONG = 6
+#: Lines that repeat time and channel are more only where several series have the same names: an alarm at the time of a value is rare.
+_SAME_TIME = 0.1
 #: Columns of a table of changes that say how a value was read.
 _STATE = re.compile(r"quality|alarm|status|severity|state|flag|güte", re.I)
 #: Units at the end of a heading, after a space or an underscore.
@@ -177,8 +181,9 @@ class TableProposal:
     def may_be_record(self) -> bool:
         """Whether temperatures and displacements are found, or something that may be the displacement."""
         remarks, temperatures = [column.remark for column in self.columns], self.of("temperature")
-        # One of two temperatures that only their values tell may be the displacement.
-        guessed = _NOT_KNOWN in remarks or (_BY_VALUES in remarks and len(temperatures) > 1)
+        # One of two temperatures that only their values tell may be the displacement, as the signal of a sensor may.
+        signal = any(one.unit in _OF_SIGNALS and (one.role == "driver" or one.remark) for one in self.columns)
+        guessed = signal or _NOT_KNOWN in remarks or (_BY_VALUES in remarks and len(temperatures) > 1)
         return not self.lacks or (guessed and (bool(temperatures) or _BY_VALUES in remarks))
 
     def lines(self) -> Iterator[str]:
@@ -208,6 +213,8 @@ class TableProposal:
             for number in numbers:
                 before = columns[number - 1]
                 usual, remark = _usual_unit(role, before)
+                if role == "displacement" and before.unit in _OF_SIGNALS:
+                    usual, remark = before.unit, UNIT_NOT_KNOWN
                 unit = match[4] or (before.unit if _is_unit_of(role, before.unit) else "")
                 columns[number - 1] = replace(before, role=role, unit=unit or usual, remark="" if unit else remark)
         times = [column for column in columns if column.role == "time"]
@@ -251,7 +258,7 @@ def propose_table(path: Path) -> TableProposal:
     if frame.empty:
         raise LaserFormatError(f"{path}: no rows below the header")
     units = dict[str, str]()
-    keys |= {} if "long" in keys else _long(rows, asked, units)
+    keys |= {} if "long" in keys else _long(path, rows, asked, units)
     if "long" in keys:
         channels = frame.groupby(logs.stripped(frame[keys["long"]["channel"]]).replace("", None))
         groups = {str(name): values[keys["long"]["value"]] for name, values in channels}
@@ -426,7 +433,9 @@ def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str
     given = [text for text in above[-1][1] if text]
     # Names may be blank above the second of two columns.
     over = [(line, fields) for line, fields in rows[:first] if line < above[-1][0] and sum(map(bool, fields)) > 1]
-    if over and 2 * sum(map(is_unit, given)) >= len(given):
+    # Names do not repeat, as degC above every thermocouple does.
+    repeats = any(map(is_unit, given)) and len(set(given)) < len(given)
+    if over and (repeats or 2 * sum(map(is_unit, given)) >= len(given)):
         header |= {"names": over[-1][0], "units": above[-1][0]}
     elif over and _is_over(over[-1][1], above[-1][1]):
         header["units"] = over[-1][0]
@@ -454,11 +463,13 @@ def _numbers_channels(rows: Sequence[tuple[int, list[str]]]) -> bool:
     )
 
 
-def _long(rows: logs.Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str, Any]:
+def _long(path: Path, rows: logs.Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str, Any]:
     """Return the layout of a table with a line for every change: a time, a name that recurs, a number; add the units of its channels."""
     frame, keys, open_ = rows.frame, dict[str, Any](), dict[str, str]()
-    written = {name: logs.stripped(frame[name]) for name in frame if not pd.api.types.is_numeric_dtype(frame[name])}
-    if not 3 <= len(frame.columns) <= _WIDEST_LONG or not written:
+    # A column that says one thing throughout says nothing of a line.
+    telling = [name for name in frame if frame[name].nunique() > 1]
+    written = {name: logs.stripped(frame[name]) for name in telling if not pd.api.types.is_numeric_dtype(frame[name])}
+    if len(frame.columns) < 3 or not written:
         return {}
     times = _times(rows, keys, open_)
     written = {name: texts for name, texts in written.items() if name not in times}
@@ -467,10 +478,24 @@ def _long(rows: logs.Rows, asked: dict[str, str], units: dict[str, str]) -> dict
     of_units = [name for name, texts in distinct.items() if texts and all(map(is_unit, texts))]
     names = {name: len(texts) for name, texts in distinct.items() if name not in (*numbers, *of_units)}
     channel = max(names, key=names.__getitem__, default="")
-    values = [name for name in frame if name not in (*times, *names, *of_units) and frame[name].nunique() > 1]
-    values = [name for name in values if not _STATE.search(str(name))] or values
-    if not times or len(values) != 1 or not 1 < names.get(channel, 0) < len(frame) / 3:
+    if not times or not 1 < names.get(channel, 0) < len(frame) / 3:
         return {}
+    # What is the same on all lines of a channel describes it, as the number of its table does.
+    of_channel = frame.groupby(written[channel])[telling].nunique().max()
+    telling = [name for name in telling if name in (*times, channel, *of_units) or of_channel[name] > 1]
+    values = [name for name in telling if name not in (*times, *names, *of_units)]
+    values = [name for name in values if not _STATE.search(str(name))] or values
+    if len(telling) > _WIDEST_LONG or len(values) != 1:
+        return {}
+    more = [str(name) for name in names if name in telling and name != channel]
+    if (
+        more
+        and frame.duplicated([*times, channel]).mean() > _SAME_TIME > frame.duplicated([*times, channel, *more]).mean()
+    ):
+        raise LaserFormatError(
+            f"{path}: lines of one time and one {channel} differ by {listed(more)}; give those of each {more[0]} in a file of "
+            "their own, or write both names in one column"
+        )
     asked |= open_
     for name, unit in sorted(set(zip(written[channel], written[of_units[0]], strict=True))) if of_units else ():
         # Two units of one channel are none.
@@ -744,7 +769,9 @@ def _word(name: str) -> tuple[str, str]:
         found = next((word for word in words if word in known), "")
         if found:
             return found, role
-    return "", ""
+    # Lagertemperatur, airtemp.
+    endings = ((end, role) for role, known in _WORDS for end in known if len(end) >= _SHORTEST_ENDING)
+    return next(((end, role) for end, role in endings if any(word.endswith(end) for word in words)), ("", ""))
 
 
 def _usual_unit(role: str, column: Column) -> tuple[str, str]:

@@ -244,10 +244,18 @@ def _not_used(content: FolderContent, lines: Sequence[str]) -> Iterator[str]:
     left = [one for one in measured if _quoted(content.relative(one.path)) not in active]
     if left or content.unknown:
         yield from ("", _NOT_USED)
-        yield from (
-            f"#   {_plain(content.relative(one.path))}: {one.kind.value.words}{one.kind.value.unused}" for one in left
-        )
+        offered = "; [drivers] above names it in comments"
+        for one in left:
+            name, words = content.relative(one.path), f"{one.kind.value.words}{one.kind.value.unused}"
+            if _logs_temperatures(one):
+                words = f"temperatures without a displacement{offered if f'# file = {_quoted(name)}' in lines else ''}"
+            yield f"#   {_plain(name)}: {words}"
         yield from (f"#   {_plain(content.relative(one.path))}: {_plain(one.reason)}" for one in content.unknown)
+
+
+def _logs_temperatures(found: Recognised) -> bool:
+    """Whether a file is a log of temperatures, as of the air, without a displacement."""
+    return found.kind is Kind.RECORD and found.content.lacking == ["displacement"]
 
 
 def _axis(readings: Recognised, asker: Asker) -> Iterator[str]:
@@ -488,6 +496,17 @@ def _drivers(content: FolderContent) -> Iterator[str]:
     if content.of(Kind.DRIVERS):
         yield from ("", "[drivers]")
         yield from _optional("file", content, Kind.DRIVERS)
+    elif logs := [one for one in content.of(Kind.RECORD) if _logs_temperatures(one) and "long" not in one.content.keys]:
+        table, name = logs[0].content, _quoted(content.relative(logs[0].path))
+        yield from (
+            "",
+            "# [drivers]                              # temperatures that the drift may follow: remove each # to use them",
+        )
+        yield f"# file = {name}"
+        yield from (f"# {key} = {_toml(value)}" for key, value in table.keys.items())
+        yield "# [drivers.columns]"
+        used = (one for one in table.columns if one.role in ROLES[1:-1])
+        yield from (f"# {_quoted(one.heading)} = {_toml({'role': one.role, 'unit': one.unit})}" for one in used)
     if content.frames and content.of(Kind.DEVIATIONS):
         yield from ("", "[model]", 'declared = ["axis_expansion", "table_offset"]')
 
@@ -556,7 +575,7 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
         group = [column for column in (*guessed, *not_known) if (column.role, column.unit) == (role, unit)]
         about = ", ".join(f"{column.heading} ({column.span})" for column in group)
         target, one = ("um", "0.0125 mm") if role == "displacement" else ("degC", "0.1 degC")
-        answer = asker.unit(f"Unit of {about}; of counts one count, such as {one}", target, unit)
+        answer = asker.unit(f"Unit of {about}; of counts or volts what one is, such as {one}", target, unit)
         taken = {
             column: replace(column, unit=answer, remark="" if column in not_known else column.remark)
             for column in group

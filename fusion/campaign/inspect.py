@@ -315,7 +315,9 @@ def _logs_drivers(found: Recognised) -> bool:
 
 
 def _logs_environment(found: Recognised) -> bool:
-    return bool(resolve_name("interferometry.io.readings:is_environment_log")(found.path))
+    # A record may log the air pressure too.
+    is_log = bool(resolve_name("interferometry.io.readings:is_environment_log")(found.path))
+    return is_log and (isinstance(found.logged, str) or bool(found.logged.lacks))
 
 
 def _holds_deviations(found: Recognised) -> bool:

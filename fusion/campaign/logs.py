@@ -96,7 +96,7 @@ HEAD = 200
 ROWS_OF_VALUES = 3
 #: Rows that may stand between them: an empty one, a remark, a header that is repeated.
 _ROWS_BETWEEN = 2
-VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
+VALUE = re.compile(r"[-+]?\s*[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
 #: Lines of values by which the columns of a text are found.
 _SAMPLE = 200
 #: Channel, date, time and value as EPICS' camonitor prints them.
@@ -216,9 +216,11 @@ def _laid_out(path: Path, layout: LoggedTable) -> tables.DelimitedTable:
     stated = {
         heading: column for pattern, column in layout.columns.items() for heading in match_columns([pattern], others)
     }
-    headings = []
+    names, headings = Counter(name_and_unit(heading)[0] for heading in used), []
     for heading in used:
         name, in_heading = name_and_unit(heading)
+        # Channels that only their places tell apart are called by their whole headings; a / parts a product.
+        name = (re.sub(r"[()\[\]]", "", heading) if names[name] > 1 else name).replace("/", "-")
         unit = (stated[heading].unit if heading in stated else "") or rows.units.get(heading, "") or in_heading
         headings.append(f"{name} [{unit_name(unit)}]" if unit else heading)
     texts = rows.frame[list(used)].map(str).to_numpy().tolist()
@@ -436,18 +438,30 @@ def sheet_of(path: Path, name: str | None = None) -> tuple[str, list[tuple[int, 
 
 def first_of_values(rows: Sequence[tuple[int, list[str]]]) -> int | None:
     """Return the place of the first row of values, None where there is none."""
-    return next((k for k in range(len(rows)) if _begin_values(rows[k : k + ROWS_OF_VALUES + _ROWS_BETWEEN])), None)
-
-
-def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
-    """Whether the first row and enough others as wide hold little but numbers and times, with a number in each."""
-    texts = [[text.strip() for text in fields if text.strip()] for _, fields in rows]
-    numeric = [sum(VALUE.fullmatch(text) is not None or has_unit(text) for text in row) for row in texts]
-    values = [
-        count >= max(1, len(row) / 2) and len(fields) == len(rows[0][1])
-        for count, row, (_, fields) in zip(numeric, texts, rows, strict=True)
+    of_values = [_is_of_values(fields) for _, fields in rows]
+    firsts = [
+        k for k in range(len(rows)) if _begin_values(rows, of_values, range(k, k + ROWS_OF_VALUES + _ROWS_BETWEEN))
     ]
-    return values[0] and sum(values) >= min(ROWS_OF_VALUES, len(rows))
+    widths = [len(fields) for _, fields in rows]
+    # Above its names a logger lists start, end and trigger, its channels and their ranges, in rows of other widths.
+    usual = (k for k in firsts if 2 * widths[k:].count(widths[k]) > len(rows) - k and not any(of_values[k - 1 : k]))
+    first = next(usual, next(iter(firsts), None))
+    # The first row alone may hold the serial number of a logger behind its values.
+    while first and of_values[first - 1] and widths[first - 1] > widths[first]:
+        first -= 1
+    return first
+
+
+def _is_of_values(fields: Sequence[str]) -> bool:
+    """Whether a row holds little but numbers and times, with a number in it."""
+    texts = [text.strip() for text in fields if text.strip()]
+    return sum(VALUE.fullmatch(text) is not None or has_unit(text) for text in texts) >= max(1, len(texts) / 2)
+
+
+def _begin_values(rows: Sequence[tuple[int, list[str]]], of_values: Sequence[bool], places: range) -> bool:
+    """Whether the first of some rows and enough others as wide are rows of values."""
+    near = [of_values[k] and len(rows[k][1]) == len(rows[places[0]][1]) for k in places[: len(rows) - places[0]]]
+    return near[0] and sum(near) >= min(ROWS_OF_VALUES, len(near))
 
 
 def text_lines(path: Path, header: HeaderRows | None = None) -> list[str]:
@@ -544,7 +558,7 @@ def _read_text(path: Path, header: HeaderRows | None) -> Rows:
     if header is None:
         before, _ = tables.find_header(lines)
         header = HeaderRows(names=before + 1, values=before + 2)
-    below = lines[header.values - 1 :]
+    below = ["\n" if line.startswith("#") else line for line in lines[header.values - 1 :]]
     if header.names:
         names = "".join(lines[header.names - 1 : header.names])
         values = max(below[:_SAMPLE], key=len, default="")

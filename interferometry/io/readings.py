@@ -1342,5 +1342,6 @@ def _environment_table(path: Path) -> tuple[DelimitedTable, str, dict[str, tuple
             return table_below(grid, at), headings["time"].text, named
     expected = ",".join(("time", *(column for column, *_ in ENVIRONMENT_COLUMNS)))
     raise LaserFormatError(
-        f"{path}: no table of air and material: {best[1]}; expected {expected!r} (the heading names the unit, which may be another)"
+        f"{path}: no table of air and material: {best[1]}; expected {expected!r} (the heading names the unit, which may be another); a "
+        "log that does not hold all of these is named as file under [drivers]"
     )

@@ -831,3 +831,61 @@ def test_sheets_of_one_time_belong_together_and_two_runs_are_asked(tmp_path: Pat
     np.testing.assert_allclose(data["temperature"].values[:, 0], SPINDLE)
     lines = [head, *zip(stamps, SPINDLE, NOSE, strict=True)]
     assert propose_table(book("runs", Run1=lines, Run2=lines) / "log.xlsx").asked == {"sheet": "Run2"}
+
+
+def test_a_logger_lists_its_channels_and_times_above_its_table(tmp_path: Path) -> None:
+    """Graphtec's GL820: three rows of dates, spans of channels, units repeated below the names, signs apart from the digits."""
+    path = tmp_path / "gl820.csv"
+    path.write_text(
+        "Vendor,GRAPHTEC Corporation\nStart time,2026-03-09,22:30:00\nEnd time,2026-03-10,00:29:30\nTrigger time,2026-03-09,22:30:00\n"
+        'CH,Signal name,Input,Range,Filter,Span\nCH1, "a",TEMP,TC_K,5,70.0,20.0,degC\nCH2, "b",TEMP,TC_K,5,70.0,20.0,degC\nData\n'
+        "Number,Date&Time,ms,CH1,CH2,CH3,Alarm1-10,Alarm11-20,AlarmOut\nNO.,Time,ms,degC,degC,mm,A1234567890,A1234567890,A1234\n"
+        + rows("{k},{time:%Y/%m/%d %H:%M:%S},0,+  {t1},+  {t2},{z:+7.4f},LLLLLLLLLL,LLLLLLLLLL,LLLL")
+    )
+    table = propose_table(path)
+    assert (table.rows, [one.heading for one in table.of("temperature")]) == (240, ["CH1", "CH2"])
+    assert [(one.heading, one.unit) for one in table.of("displacement")] == [("CH3", "mm")]
+    assert (table.of("temperature")[0].low, table.of("displacement")[0].high) == (SPINDLE.min(), NOSE.max())
+
+
+def test_the_first_row_alone_may_hold_what_stands_once(tmp_path: Path) -> None:
+    """EasyLog writes its serial number behind the first values: they are no names."""
+    path = tmp_path / "easylog.txt"
+    lines = rows("{k},{time:%Y-%m-%d %H:%M:%S},{t1},{z}").splitlines()
+    path.write_text("\n".join(["shop,Time,Celsius(°C),Growth(mm),Serial Number", f"{lines[0]},0100", *lines[1:]]))
+    table = propose_table(path)
+    assert (table.rows, table.lacks, table.of("temperature")[0].heading) == (240, "", "Celsius(°C)")
+
+
+def test_what_is_the_same_on_all_lines_of_a_channel_describes_it(tmp_path: Path) -> None:
+    """InfluxDB's annotated CSV, a table for each field; two machines whose fields have one name are not mixed."""
+    names = ",result,table,_start,_stop,_time,_value,_field,_measurement,host"
+    above = f"#datatype,string,long,dateTime:RFC3339,dateTime:RFC3339,dateTime:RFC3339,double,string,string,string\n{names}\n"
+    line = ",,{0},2026-03-09T22:00:00Z,2026-03-10T01:00:00Z,{{time:%Y-%m-%dT%H:%M:%SZ}},{{{1}}},{2},machine,{3}"
+    fields = ("t1", "spindle_C"), ("z", "nose_mm")
+    (tmp_path / "one.csv").write_text(
+        "\n".join(above + rows(line.format(n, key, field, "M1")) for n, (key, field) in enumerate(fields))
+    )
+    table = propose_table(tmp_path / "one.csv")
+    assert table.keys["long"] == {"time": "_time", "channel": "_field", "value": "_value"}
+    assert [(one.heading, one.unit) for role in ("temperature", "displacement") for one in table.of(role)] == [
+        ("spindle_C", "degC"),
+        ("nose_mm", "mm"),
+    ]
+    both = [rows(line.format(0, key, field, host)) for key, field in fields for host in ("M1", "M2")]
+    (tmp_path / "two.csv").write_text(f"{names}\n{''.join(both)}")
+    with pytest.raises(
+        LaserFormatError, match="one _field differ by host; give those of each host in a file of their own"
+    ):
+        propose_table(tmp_path / "two.csv")
+
+
+def test_a_voltage_may_be_the_displacement_and_what_a_volt_is_has_no_default(tmp_path: Path) -> None:
+    """A probe on a logger of voltages; words of names may be compound."""
+    path = tmp_path / "volts.csv"
+    path.write_text("time,spindletemp,Lagertemperatur,CH4 (V)\n" + rows("{time},{t1},{t2},{z}"))
+    table = propose_table(path)
+    assert (table.may_be_record, [one.unit for one in table.of("temperature")]) == (True, ["degC", "degC"])
+    taken = table.corrected("4 = displacement").columns[3]
+    assert (taken.unit, taken.remark) == ("V", "unit not known")
+    assert table.corrected("4 = displacement 20 um").columns[3].unit == "20 um"

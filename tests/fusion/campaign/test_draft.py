@@ -272,6 +272,23 @@ def test_measured_files_that_the_campaign_does_not_take_are_told(tmp_path):
     assert load_campaign(path).interferometry is not None
 
 
+def test_a_log_of_temperatures_beside_a_laser_is_offered_as_drivers(tmp_path):
+    """HOBO's export: channels that only their places tell apart, no displacement, and no material for an environment."""
+    folder = write_laser(tmp_path / "test", 5, 4).parent
+    (folder / "campaign.toml").unlink()
+    channels = ",".join(f'"Temp, °C (LGR S/N: 20750528, LBL: {place})"' for place in ("air", "bed"))
+    rows = [
+        f"{k + 1},03/09/26 {6 + k // 60:02}:{k % 60:02}:26 AM,{21 + k / 99:.3f},{20 + k / 99:.3f}" for k in range(300)
+    ]
+    (folder / "hobo.csv").write_text("\n".join(['"Plot Title: shop"', f'"#","Date Time, GMT+00:00",{channels}', *rows]))
+    path, _ = write_campaign(folder, Asker(None))
+    assert "hobo.csv: temperatures without a displacement; [drivers] above names it in comments" in unused_files(path)
+    above, below = path.read_text().split("# [drivers]")
+    path.write_text(f"{above}[drivers]{below.replace(chr(10) + '# ', chr(10))}".split("Files in this folder")[0])
+    read = check_campaign(path)
+    assert read.faults == () and any("LBL: air" in line and "LBL: bed" in line for line in read.lines())
+
+
 @pytest.mark.skipif(os.name != "posix", reason="names of files are bytes on POSIX systems only")
 def test_a_name_that_is_no_text_is_refused(tmp_path):
     name = os.fsdecode(b"\xff.csv")

@@ -347,6 +347,15 @@ def test_a_record_is_known_in_every_encoding(tmp_path, encoding):
         assert (found.kind, found.headings) == (Kind.RECORD, ("Zeit [s]", "T1 [°C]", "Z [µm]"))
 
 
+def test_a_record_may_log_the_air_pressure(tmp_path):
+    rows = [
+        f"09.03.2026 06:{k:02}:00;{21 + k / 9:.2f};1010,2;{k}".replace(".", ",").replace("09,03,", "09.03.")
+        for k in range(50)
+    ]
+    (tmp_path / "a.csv").write_text("\n".join(["Zeit;Spindeltemperatur;Luftdruck;Verlagerung Z", *rows]))
+    assert recognise(tmp_path / "a.csv").kind is Kind.RECORD
+
+
 def test_a_campaign_folder_is_sorted_out(campaign_folder):
     content = scan_folder(campaign_folder)
     assert content.frames == ("thermal/*.jpg",)

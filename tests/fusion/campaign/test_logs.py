@@ -70,7 +70,7 @@ def test_drivers_are_sorted_and_bad_lines_listed(tmp_path: Path) -> None:
     with pytest.raises(TableError, match="more than one column is named t; give each its own name"):
         read_drivers(path)
     path.write_text("stamp,t [degC],t (degC)\n2026-03-09T06:31:00+00:00,1,2\n")
-    with pytest.raises(TableError, match="more than one column is named t; give each its own name"):
+    with pytest.raises(TableError, match="more than one column is named t degC; give each its own name"):
         read_drivers(path, DriversTable(file="drivers.csv", time="stamp").layout)
 
 
