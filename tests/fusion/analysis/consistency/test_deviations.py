@@ -14,7 +14,7 @@ from fusion.analysis.consistency.deviations import (
     find_gross_readings,
     random_part_um,
 )
-from fusion.pipeline.consistency import Check, _of_readings, run_checks
+from fusion.pipeline.consistency import Check, _with_readings, run_checks
 from interferometry.deviations import build_deviations
 
 CYCLES, TARGETS = 40, 12
@@ -269,7 +269,7 @@ def test_without_any_reading_there_is_nothing_to_check() -> None:
     assert np.isnan(random_part_um(values))
     nothing = with_deviation(sound(), np.full((CYCLES, 2, TARGETS), np.nan))
     source = SimpleNamespace(deviations=nothing, campaign=SimpleNamespace(plan=None), sensors=None)
-    assert "linear" not in _of_readings(source)
+    assert _with_readings(Inputs(), source).linear is None
 
 
 # Order and sign of the readings: exchanged labels and inverted signs are named, sound readings and step cycles pass.
