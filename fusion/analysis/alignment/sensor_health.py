@@ -21,6 +21,7 @@ from fusion.analysis.alignment.readings import sample_noise
 from fusion.analysis.levels import SENSOR_LEVEL
 from fusion.common import Array
 from fusion.results.loop import SensorFaultPart
+from thermography.common import MAD_TO_SIGMA
 
 # Changes of a temperature sensor over some time, and what others, loads and its own past leave of them.
 
@@ -220,7 +221,7 @@ def _robust_ridge(own: Array, regressors: Array, most: float) -> Array:
         weighted = standard * weights[:, None]
         coefficients = np.linalg.solve(weighted.T @ standard / own.size + penalty, weighted.T @ own / own.size)
         missed = np.abs(own - standard @ coefficients)
-        scale = max(1.4826 * float(np.median(missed)), 1e-9)
+        scale = max(MAD_TO_SIGMA * float(np.median(missed)), 1e-9)
         weights = 1.0 / np.maximum(1.0, missed / (_HUBER * scale))
     return np.asarray(coefficients / np.where(spread > 0.0, spread, np.inf))
 

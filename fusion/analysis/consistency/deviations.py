@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.consistency.checks import LASER, Found, check, judge
 from fusion.common import Array
-from thermography.common import scatter_by_median
+from thermography.common import MAD_TO_SIGMA, scatter_by_median
 
 #: Deviations that spread over more than this share of the travel, and over more than a millimetre or the distance of two targets, look like
 #: another unit: short stages scatter over 6 % of their travel, printers over tenths of a millimetre, and only an axis whose scale was never
@@ -79,7 +79,7 @@ def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
     """Find readings that are errors of reading: they are left out where drift and field are compared and modelled."""
     size = abs(standardised)
     # The median absolute deviation about zero, in standard deviations of a normal distribution.
-    scatter = (size.median("cycle") / scipy.special.ndtri(0.75)).fillna(1.0).clip(min=1.0)
+    scatter = (MAD_TO_SIGMA * size.median("cycle")).fillna(1.0).clip(min=1.0)
     return size > _GROSS_SIGMAS * scatter
 
 
@@ -117,7 +117,7 @@ def _unit_change(values: Array) -> tuple[int, float]:
     if len(values) < 2 * _UNIT_SIDE or values.shape[2] < _LEAST_TARGETS:
         return 0, 1.0
     window = np.lib.stride_tricks.sliding_window_view(values, _UNIT_SIDE, axis=0)
-    noise = np.median(np.abs(np.diff(window, 2, axis=-1)), axis=(1, 2, 3)) / (scipy.special.ndtri(0.75) * np.sqrt(6.0))
+    noise = MAD_TO_SIGMA * np.median(np.abs(np.diff(window, 2, axis=-1)), axis=(1, 2, 3)) / np.sqrt(6.0)
     shape = np.sqrt((_bent(window.mean(axis=-1), np.arange(window.shape[-2], dtype=float)) ** 2).mean(axis=(1, 2)))
     # A mean over the window shows a shape where that is large against its noise.
     clear = shape > _SHAPE_CLEAR * noise / np.sqrt(_UNIT_SIDE)

@@ -32,6 +32,7 @@ from fusion.analysis.attribution.significance import (
 from fusion.analysis.drift_model.null_simulation import rank_p_value
 from fusion.common import Array, FusionError
 from interferometry.deviations import ROUNDING, resolution_um
+from thermography.common import MAD_TO_SIGMA
 
 #: Candidate time constants of the response to the local temperature, s.
 LAGS_S = (0.0, 600.0, 1800.0, 3600.0)
@@ -211,7 +212,7 @@ def _typical_scatter(residuals: Array, design: Array, sound: NDArray[np.bool_], 
     kept = 1.0 - np.einsum("ij,jk,ik->i", design[sound], normal, design[sound])
     scaled = residuals[:, :, sound] / np.sqrt(kept)
     read = np.isfinite(scaled).any(axis=0)
-    others = 1.4826 * np.nanmedian(np.abs(scaled[:, read]), axis=0)
+    others = MAD_TO_SIGMA * np.nanmedian(np.abs(scaled[:, read]), axis=0)
     return float(np.median(others) * np.sqrt(1.0 + design[column] @ normal @ design[column]))
 
 

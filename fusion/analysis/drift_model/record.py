@@ -102,6 +102,7 @@ from interferometry.common import one_thread
 from interferometry.deviations import ROUNDING
 from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
 from interferometry.drift.kalman import DriftModelError
+from thermography.common import MAD_TO_SIGMA
 
 # Digits of the readings: nothing is stated that rounding may look like.
 
@@ -822,7 +823,7 @@ def examine(model: RecordFit, hold_out_rmse: Array, step: Array, rng: np.random.
     is_larger = False
     for k, (fit, rows) in enumerate(zip(model.channels, model.rows, strict=True)):
         whitened, _ = fit.system.whiten(fit.residual()[:, None])
-        scale = 1.4826 * np.median(np.abs(whitened)) or 1.0
+        scale = MAD_TO_SIGMA * np.median(np.abs(whitened)) or 1.0
         innovations[rows, k] = np.clip(whitened[:, 0] / scale, -_CLIP, _CLIP)
         is_larger |= bool(np.sqrt(np.mean(whitened**2)) > half[k])
         half[k] /= scale

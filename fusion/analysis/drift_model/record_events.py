@@ -26,6 +26,7 @@ from fusion.analysis.effects.effect import Candidate
 from fusion.analysis.levels import RECORD_ENTRY_LEVEL
 from fusion.common import Array
 from fusion.results.parts import Quantity
+from thermography.common import MAD_TO_SIGMA
 
 #: Cells of equal length that readings are laid into at most: a longer log has means of neighbours.
 _MOST_CELLS = 20_000
@@ -320,7 +321,7 @@ class _Cells:
             own = _robust_slopes(changes[rows], courses[rows])
             slopes[:, k], left = basis @ own, changes - courses @ own
             left -= np.median(left[rows])
-            scaled[:, k] = left / (1.4826 * np.median(np.abs(left[rows])) or np.inf)
+            scaled[:, k] = left / (MAD_TO_SIGMA * np.median(np.abs(left[rows])) or np.inf)
         return scaled
 
     def load_that_changes(self, seen: _Seen) -> str:
@@ -330,7 +331,7 @@ class _Cells:
         moved = np.abs(_changes(self.moved[:, : len(self.names)], seen.gap, seen.mean))
         here = moved[seen.at - seen.mean]
         for name, all_of_it, own in zip(self.names, moved[np.isfinite(moved[:, 0])].T, here, strict=True):
-            scale = 1.4826 * float(np.median(all_of_it))
+            scale = MAD_TO_SIGMA * float(np.median(all_of_it))
             if own > _UNUSUAL * scale and own > 0.0 and (all_of_it >= own).mean() < _SELDOM:
                 return name
         return ""
@@ -847,7 +848,7 @@ def _robust_slopes(changes: Array, courses: Array) -> Array:
         weighted = design * weights[:, None]
         slopes = np.linalg.lstsq(weighted.T @ design, weighted.T @ y, rcond=None)[0]
         left = np.abs(y - design @ slopes)
-        weights = np.minimum(1.0, _HUBER * 1.4826 * float(np.median(left)) / np.maximum(left, 1e-300))
+        weights = np.minimum(1.0, _HUBER * MAD_TO_SIGMA * float(np.median(left)) / np.maximum(left, 1e-300))
     return np.asarray(slopes[:-1])
 
 
@@ -882,7 +883,7 @@ def _noise_and_walk(values: Array, longest: int) -> tuple[float, float]:
     for lag in lags:
         changes = np.abs(values[lag:] - values[:-lag])
         changes = changes[np.isfinite(changes)]
-        variances.append((1.4826 * float(np.median(changes))) ** 2 if changes.size else np.nan)
+        variances.append((MAD_TO_SIGMA * float(np.median(changes))) ** 2 if changes.size else np.nan)
     known = np.isfinite(variances) & (np.asarray(variances) > 0.0)
     if not known.any():
         return 1e-12, 1e-12

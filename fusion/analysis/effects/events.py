@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.readings import ENVIRONMENT, Readings, Series
 from fusion.analysis.effects.effect import Candidate, Parameters, Separable, Wave, effect
 from fusion.common import Array
+from thermography.common import MAD_TO_SIGMA
 
 # Episodes in what was logged or seen: isolated jumps, sensors that stick, and the instants at which a reading could
 # step.
@@ -64,7 +65,7 @@ def detect_jumps(series: Series) -> list[tuple[float, float, float]]:
     for k in range(changes.size):
         low, high = max(0, k - 3), min(changes.size, k + 4)
         excess[k] = changes[k] - np.median(np.delete(changes[low:high], k - low))
-    scatter = 1.4826 * np.median(np.abs(excess - np.median(excess)))
+    scatter = MAD_TO_SIGMA * np.median(np.abs(excess - np.median(excess)))
     # A log in steps of its resolution has no finer scatter than one step.
     steps = np.abs(changes[changes != 0.0])
     resolution = float(steps.min()) if steps.size and np.unique(np.round(steps, 9)).size < steps.size / 2 else 0.0
