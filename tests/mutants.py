@@ -53,6 +53,8 @@ _ALSO = {
     "fusion/analysis/drift_model/search.py": ("tests/fusion/analysis/drift_model/test_evaluation.py",),
     "fusion/analysis/drift_model/admissibility.py": ("tests/fusion/analysis/drift_model/test_gains.py",),
 }
+#: Examples in the docstrings of a module.
+_EXAMPLES = "tests/test_public_api.py::test_examples_in_docstrings_run"
 #: Decorators that change no value, only speed and form.
 _FORM = re.compile("njit|dataclass")
 
@@ -188,6 +190,8 @@ def main() -> None:
     module: Path = given.module
     text = module.read_text(encoding="utf-8")
     tests = [str("tests" / module.parent / f"test_{module.name}"), *_ALSO.get(str(module), ())]
+    if ">>> " in text:
+        tests.append(f"{_EXAMPLES}[{'.'.join(module.with_suffix('').parts)}]")
     sys.path.insert(0, str(Path.cwd()))
     allowed = 10 + 3 * _stand_ready(module, tests)
     if not passes(tests, allowed):

@@ -59,8 +59,7 @@ def shown_zone(table: xr.Dataset, stated: str | None) -> str | None:
 
 def is_dated(times: NDArray[np.datetime64]) -> bool:
     """Tell whether times hold a date; those without a stated beginning count from zero."""
-    known = times[~np.isnat(times)]
-    return bool(known.size and known.max() > DATED)
+    return bool((times > DATED).any())
 
 
 def time_part(table: xr.Dataset, stated: str | None) -> TimePart | None:
@@ -68,8 +67,7 @@ def time_part(table: xr.Dataset, stated: str | None) -> TimePart | None:
     times = table["time"].values
     if not is_dated(times):
         return None
-    times = times[~np.isnat(times)]
-    return TimePart(first=utc(times.min()), last=utc(times.max()), zone=shown_zone(table, stated))
+    return TimePart(first=utc(np.nanmin(times)), last=utc(np.nanmax(times)), zone=shown_zone(table, stated))
 
 
 def zone_notices(table: xr.Dataset, *, code: str, of: str) -> Iterator[Notice]:

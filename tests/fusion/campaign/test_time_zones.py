@@ -10,7 +10,8 @@ import xarray as xr
 
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import read_record, read_source
-from fusion.campaign.time_zones import bring_to_utc, lacks_zone, refuse_mixed_zones
+from fusion.campaign.time_zones import bring_to_utc, lacks_zone, refuse_mixed_zones, time_part, zone_notices
+from fusion.results.parts import TimePart
 from interferometry.io.tables import NO_ZONE
 from tests.fusion.campaign_parts import change
 
@@ -35,6 +36,22 @@ def test_times_with_a_zone_or_without_a_stated_one_stay() -> None:
     assert bring_to_utc(zoned, "Europe/Vienna", file="") is zoned
     bare = table("2026-07-15T10:00")
     assert bring_to_utc(bare, None, file="") is bare
+    late = bring_to_utc(bare, None, file="", late_s=60.0)
+    assert late["time"].values == np.datetime64("2026-07-15T09:59") and lacks_zone(late)
+
+
+@pytest.mark.parametrize(
+    ("reference", "stated", "zone"),
+    [(NO_ZONE, None, ""), (NO_ZONE, "Europe/Vienna", "Europe/Vienna"), ("UTC in the file", None, None)],
+)
+def test_readings_have_a_first_and_a_last_time_in_a_zone_where_they_have_dates(
+    reference: str, stated: str | None, zone: str | None
+) -> None:
+    dated = table("NaT", "2026-07-15T10:00", "2026-07-15T09:00", reference=reference)
+    assert time_part(dated, stated) == TimePart(first="2026-07-15T09:00:00Z", last="2026-07-15T10:00:00Z", zone=zone)
+    assert len([*zone_notices(dated, code="no_zone", of="laser.csv")]) == (reference == NO_ZONE)
+    counted = table("NaT", "1970-01-01T01:00", reference=reference)
+    assert time_part(counted, stated) is None and not [*zone_notices(counted, code="no_zone", of="laser.csv")]
 
 
 @pytest.mark.parametrize("time", ["2026-10-25T02:30", "2026-03-29T02:30"])
