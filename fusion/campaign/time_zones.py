@@ -30,8 +30,7 @@ def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str, late_s: floa
     elif not late_s:
         return table
     utc = (stamps - pd.Timedelta(seconds=late_s)).values.astype("datetime64[ns]").reshape(time.shape)
-    place = table.assign_coords if "time" in table.dims else table.assign
-    return place(time=(time.dims, utc, time.attrs))
+    return table.assign(time=(time.dims, utc, time.attrs))
 
 
 def from_zone(stamps: NDArray[np.datetime64], zone: str, *, file: str) -> NDArray[np.datetime64]:

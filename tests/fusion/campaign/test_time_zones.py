@@ -56,8 +56,8 @@ def test_readings_have_a_first_and_a_last_time_in_a_zone_where_they_have_dates(
 
 @pytest.mark.parametrize("time", ["2026-10-25T02:30", "2026-03-29T02:30"])
 def test_the_hour_in_which_clocks_are_changed_is_refused(time: str) -> None:
-    with pytest.raises(CampaignError, match=rf"drivers.csv: 1 times, the first {time}:00, .* in Europe/Vienna.*in UTC"):
-        bring_to_utc(table("2026-03-01T10:00", time), "Europe/Vienna", file="drivers.csv")
+    with pytest.raises(CampaignError, match=rf"drivers.csv: 2 times, the first {time}:00, .* in Europe/Vienna.*in UTC"):
+        bring_to_utc(table("2026-03-01T10:00", time, f"{time}:10"), "Europe/Vienna", file="drivers.csv")
 
 
 def test_logs_with_and_without_a_zone_are_not_mixed() -> None:
