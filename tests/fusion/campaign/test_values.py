@@ -12,10 +12,15 @@ from pydantic import TypeAdapter
 from fusion.campaign import values as value_types
 from fusion.campaign.values import (
     QuantityError,
+    area,
+    canonical_unit,
+    column_conversion,
     conversion,
     matching_files,
+    name_and_unit,
     read_option,
     read_quantity,
+    role_of_unit,
     stored_path,
     unit_name,
 )
@@ -79,12 +84,69 @@ def test_an_option_is_named_with_what_was_written() -> None:
         ("Fraction", "45 %", 0.45),
         ("KelvinU", "20 mK", 0.02),
         ("TimeZone", "Europe/Vienna", "Europe/Vienna"),
-        ("PixelPatch", [8, 8, 24, 16], (8, 8, 24, 16)),
+        ("PixelPatch", [0, 0, 1, 1], (0, 0, 1, 1)),
+        ("PartsPerMillion", "200 ppm/K", 200.0),
+        ("FractionU", "0 %", 0.0),
+        ("Cycles", "10-14", (10, 14)),
+        ("Point", ["120 px", "2 cm"], ((120.0, "px"), (20.0, "mm"))),
     ],
 )
 def test_a_value_comes_in_the_unit_of_its_name(name: str, written: Any, value: Any) -> None:
     read = TypeAdapter(getattr(value_types, name)).validate_python(written)
     assert read == (pytest.approx(value) if isinstance(value, float) else value)
+
+
+@pytest.mark.parametrize(
+    ("name", "written", "why"),
+    [
+        ("PartsPerMillion", "-10 ppm/K", "an expansion coefficient in ppm/K must be above -10 and at most 200"),
+        ("PartsPerMillionU", "1e-3 ppm/K", "a standard uncertainty in ppm/K must be above 0.001 and at most 200"),
+        ("Celsius", "3001 degC", "a temperature in degC must be above -273.15 and at most 3000"),
+        ("Fraction", "0 %", "this fraction must be above 0 and at most 1"),
+        ("FractionU", "101 %", "1.01 of a share lies outside 0 to 1"),
+        ("Cycles", "5", "one cycle has no standard deviation"),
+        ("Cycles", "5-1", 'ends before it begins; write for example "1-5"'),
+        ("TimeUnit", "mm", "not a unit of a time; use one of"),
+        ("PixelPatch", [0, 0, 0, 1], "contains no pixel"),
+        ("PixelPatch", [0, -1, 1, 1], "contains no pixel"),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused(name: str, written: Any, why: str) -> None:
+    with pytest.raises((ValueError, QuantityError), match=why):
+        TypeAdapter(getattr(value_types, name)).validate_python(written)
+
+
+@pytest.mark.parametrize(
+    ("heading", "name", "unit"),
+    [
+        ("t1(°C)", "t1", "degC"),
+        ("head (deg C)", "head", "degC"),
+        ("Z [Microns]", "Z", "um"),
+        ("spindle speed (RPM) ", "spindle speed", "RPM"),
+        ("Z [um] left", "Z  left", "um"),
+        ("elapsed_s", "elapsed", "s"),
+        ("t/min", "t", "min"),
+        ("T/K", "T", "K"),
+        ("um/K", "um/K", ""),
+        ("load/s", "load/s", ""),
+        ("Z (100 mm)", "Z (100 mm)", ""),
+        ("5x Z (mm)", "Z", "5x mm"),
+        ("x10", "x10", ""),
+    ],
+)
+def test_a_heading_has_a_name_and_a_unit(heading: str, name: str, unit: str) -> None:
+    assert name_and_unit(heading) == (name, unit)
+
+
+def test_a_column_is_counted_in_parts_of_its_unit_which_tells_what_it_holds() -> None:
+    assert column_conversion("0.0125 mm", "um") == (12.5, 0.0)
+    assert [role_of_unit(unit) for unit in ("0.1 °C", "mm", "A")] == ["temperature", "displacement", "driver"]
+    assert [canonical_unit(unit) for unit in ("um", "degF", "min")] == ["um", "degC", "s"]
+
+
+def test_an_area_has_no_sense() -> None:
+    corners = ((1.0, 0.0), (5.0, 0.0), (5.0, 3.0))
+    assert area(corners) == area(corners[::-1]) == 6.0
 
 
 @pytest.mark.parametrize("pattern", ["/**/*", "/**/*.jpg", "/*/**/*.jpg", "../" * 20 + "**/*.seq"])
