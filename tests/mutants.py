@@ -49,6 +49,11 @@ _ALSO = {
     ),
     # The memory of the noise is held where profiles and anomalies meet it.
     "interferometry/drift/gls.py": ("tests/interferometry/drift/test_estimate.py",),
+    # Numbers of days, and values with their uncertainty.
+    "fusion/campaign/values.py": (
+        "tests/fusion/campaign/test_columns.py::test_days_counted_from_a_date_are_told_by_their_numbers_and_marked[datenum-719529]",
+        "tests/fusion/campaign/test_keys.py",
+    ),
     # The end of the search, and the scorer of candidates.
     "fusion/analysis/drift_model/search.py": ("tests/fusion/analysis/drift_model/test_evaluation.py",),
     "fusion/analysis/drift_model/admissibility.py": ("tests/fusion/analysis/drift_model/test_gains.py",),
