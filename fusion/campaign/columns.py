@@ -467,7 +467,7 @@ def _long(path: Path, rows: logs.Rows, asked: dict[str, str], units: dict[str, s
     """Return the layout of a table with a line for every change: a time, a name that recurs, a number; add the units of its channels."""
     frame, keys, open_ = rows.frame, dict[str, Any](), dict[str, str]()
     # A column that says one thing throughout says nothing of a line.
-    telling = [name for name in frame if frame[name].nunique() > 1]
+    telling = [str(name) for name in frame if frame[name].nunique() > 1]
     written = {name: logs.stripped(frame[name]) for name in telling if not pd.api.types.is_numeric_dtype(frame[name])}
     if len(frame.columns) < 3 or not written:
         return {}

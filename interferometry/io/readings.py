@@ -766,8 +766,8 @@ _ROWS_ABOVE, _ROWS_BELOW = 2, 3
 _FEWEST_TARGETS = 2
 #: Values closer to their targets than this share of the travel are measured positions.
 _NEAR = 0.02
-#: Words beside the number of a run: axis and "number".
-_BESIDE_NUMBERS = ("no", "nr", "x", "y", "z", "u", "w", "c")
+#: Words beside the number of a run: axis, "number" and the sign of ISO 230-2.
+_BESIDE_NUMBERS = ("no", "nr", "j", "x", "y", "z", "u", "w", "c")
 #: More than any table of positions by run has; rows are given the width of the widest one, which must not fill the memory.
 _MOST_CELLS = 5_000_000
 
@@ -854,6 +854,8 @@ def _find_block(grid: Grid) -> WideTable | None:
         # Without a column of positions, that of the targets gives them: "Target" is the usual word for both.
         name = "position" if any(heading.role == "position" for heading in headings) else "target"
         below = (_positions_below(grid, cells, at, column) for column, one in enumerate(headings) if one.role == name)
+        if (across := _directions_below_positions(grid, cells, at)) is not None:
+            return across
         for found in (*below, _positions_in_one_row(grid, cells, at)):
             if found is not None and (read := _read_runs(grid, found.candidates))[0]:
                 ignored, titles = (
@@ -925,6 +927,44 @@ def _positions_in_one_row(grid: Grid, cells: list[list[str]], at: int) -> _Found
     return _Found(at + 1, [(grid.rows[at][0], split[j][0]) for j in places], unit, candidates, beside)
 
 
+def _directions_below_positions(grid: Grid, cells: list[list[str]], at: int) -> WideTable | None:
+    """Return the table of the annexes of ISO 230-2: positions in one row, both directions below each, and a row for every cycle."""
+    headings = [read_heading(text) for text in cells[at]]
+    label = next((j for j, heading in enumerate(headings) if heading.role == "position"), len(headings))
+    near = range(at + 1, min(at + 1 + _ROWS_BELOW, len(cells)))
+    named = ({j: find_direction(text) for j, text in enumerate(cells[i]) if j > label and text} for i in near)
+    below, ways = next(
+        (
+            (i, ways)
+            for i, ways in zip(near, named, strict=True)
+            if None not in ways.values() and len({*ways.values()}) == 2
+        ),
+        (0, {}),
+    )
+    places = _fill(cells[at], label + 1)
+    columns = [j for j in ways if _is_number(places[j], grid.numerals)]
+    if len(columns) < 2 * _FEWEST_TARGETS or len(columns) < len(ways):
+        return None
+    of_way = {way: [j for j in columns if ways[j] == way] for way in dict.fromkeys(ways.values()) if way is not None}
+    positions = [[places[j] for j in of_one] for of_one in of_way.values()]
+    start = min(columns)
+    texts = [[text for text in row[:start] if text and read_heading(text).role != "deviation"] for row in cells]
+    told = [_wide_label(" ".join(text)) for text in texts]
+    values = [i for i in range(below + 1, len(cells)) if any(_is_number(cells[i][j], grid.numerals) for j in columns)]
+    of_cycles = {i: one[0] for i in values if (one := told[i]) is not None and one[0] is not None}
+    if positions[0] != positions[1] or not of_cycles:
+        return None
+    runs = [
+        Run(" ".join(texts[i]), number, *way, None, [(grid.rows[i][0], cells[i][j]) for j in of_way[way]])
+        for i, number in of_cycles.items()
+        for way in of_way
+    ]
+    titles = [text for row in cells for text in row[:start]]
+    line, ignored = grid.rows[at][0], [" ".join(texts[i]) for i in values if i not in of_cycles]
+    places_told = [(line, text) for text in positions[0]]
+    return WideTable(grid, line, places_told, headings[label].unit, _deviation_unit(titles), runs, ignored)
+
+
 def _fill(row: Sequence[str], start: int) -> list[str]:
     """Return a row of headings in which every blank takes the text before it, as merged cells leave it in a file of text."""
     filled = list(row)
@@ -947,14 +987,15 @@ def _wide_label(text: str) -> tuple[int | None, tuple[str, bool] | None, Unit | 
     numbers = set(re.findall(r"\d+", name))
     if len(numbers) > 1:
         return None
-    rest = re.sub(r"\d+", " ", name).replace("第", " ").replace("次", " ").replace("#", " ").strip()
+    rest = re.sub(r"\d+", " ", name).replace("第", " ").replace("次", " ").replace("#", " ").replace("=", " ").strip()
     direction: tuple[str, bool] | None = None
     for word in re.findall(
         r"[+\-−–↑↓→←]|[^\s+\-−–↑↓→←,;:/().\[\]]+", re.sub("<-+(?!>)", "←", re.sub("(?<!<)-+>", "→", rest))
     ):
         found = find_direction(word) or ((fold(word), False) if is_direction_letter(word) else None)
-        if found is not None and direction in (None, found):
-            direction = found
+        if found is not None and (direction is None or found[0] == direction[0]):
+            # "Forward ↑": the arrow names the sign.
+            direction = found[0], found[1] or (direction is not None and direction[1])
         elif not (
             read_heading(word).role in ("run", "cycle", "deviation", "direction") or fold(word) in _BESIDE_NUMBERS
         ):

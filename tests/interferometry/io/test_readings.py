@@ -373,6 +373,9 @@ DIALECTS = {
     "millimetres": table(HEADER.replace("_um", "_mm"), LINE.replace("{e}", "{mm}")),
     "inches": table(HEADER.replace("position_mm", "position (inch)"), LINE.replace("{p}", "{inch}")),
     "measured": table(HEADER.replace("deviation_um", "measured (mm)"), LINE.replace("{e}", "{measured}")),
+    "reading of a laser beside the air": table(
+        HEADER.replace("deviation_um", "Laser reading (mm),Air temp (C)"), LINE.replace("{e}", "{measured},20.1")
+    ),
     "letters": table(HEADER, LINE, plus="F", minus="B"),
     "arrows": table(HEADER, LINE, plus="→", minus="←"),
     "order of the positions": table(HEADER.replace("direction,", ""), LINE.replace("{d},", "")),
@@ -524,6 +527,20 @@ WIDE_DIALECTS = {
         for k in (1, 2)
         for way in ("forward", "reverse")
     ),
+    "form of ISO 230-2": "\n".join(
+        [
+            ",Position i," + ",".join(f"{k}," for k in (1, 2, 3)),
+            ",Target position Pi (mm)," + ",".join(f"{row[0]}," for row in ROWS),
+            ",Approach direction" + ",↑,↓" * 3,
+            *(
+                f"{'Positional deviations (µm)' if j == 1 else ''},j = {j},"
+                + ",".join(f"{row[2 * j - 1]},{row[2 * j]}" for row in ROWS)
+                for j in (1, 2)
+            ),
+            ",Mean deviation" + ",9,9" * 3,
+        ]
+    ),
+    "words and arrows": f",Forward ↑ [µm],,Reverse ↓ [µm],\nPi [mm],1,2,1,2\n{BY_DIRECTION}",
     "there and back": "Position (mm),Cycle 1 [um],Cycle 2 [um]\n"
     + "\n".join([*(f"{p},{a},{c}" for p, a, _, c, _ in ROWS), *(f"{p},{b},{d}" for p, _, b, _, d in ROWS[::-1])]),
     "two rows": f"Deviations in µm\nPosition (mm),Cycle 1,,Cycle 2,\n,+,-,+,-\n{DATA}",
@@ -616,6 +633,8 @@ def test_columns_that_are_no_runs_empty_cells_and_words_are_named(tmp_path):
     ignored = read_wide(tmp_path, WIDE_DIALECTS["summary columns"]).attrs["columns_ignored"]
     assert json.loads(ignored) == ["Mean + [um]", "s"]
     text = WIDE_DIALECTS["signs"].replace("0,1.25,", "0,,").replace("20,1.5", "20,fail")
+    form = read_wide(tmp_path, WIDE_DIALECTS["form of ISO 230-2"]).attrs["columns_ignored"]
+    assert json.loads(form) == ["Mean deviation"]
     test = read_wide(tmp_path, text + "\nMean,1,1,1,1\n")
     assert np.isnan(test["deviation"].values[0, 0, :2]).all()
     assert test.attrs["missing"] == 2
