@@ -24,7 +24,7 @@ import xarray as xr
 from pandas.io.parsers import TextParser  # type: ignore[attr-defined]
 
 from fusion.analysis.alignment.sensor_health import SensorFault, examine_readings, examine_sensors
-from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LoggedTable, LongTable, RecordTable
+from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LoggedTable, RecordTable
 from fusion.campaign.time_zones import bring_to_utc, from_zone
 from fusion.campaign.values import (
     BESIDE,
@@ -88,6 +88,8 @@ _UNIT = r"[\[(][^\])]*[\])]"
 _NAMES = (_WORDS, _APART, re.compile(rf"\S+(?: {_UNIT})?"), re.compile(rf"[^\s\[(][^\[(]*{_UNIT}"))
 _HALF = r"\d+:\d\d\S*(?: [AaPp]\.?[Mm]\.?)?|\S+"
 _VALUES = (_WORDS, re.compile(_HALF), re.compile(rf"(?:\d+[-/.]\d+[-/.]\d+ )?{_HALF}"))
+#: Most rows that hold all channels of a table whose channels stand on rows apart, and stretches in each of which every channel has one.
+_TOGETHER, _STRETCHES = 0.01, 10
 #: Lines with nothing but a rule.
 _RULED = re.compile(r"[\s=_+-]*")
 #: Lines in which the values of a table have begun.
@@ -270,16 +272,34 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
             for line in frame.index[(of_lines == "") & ~np.isnat(time)]
         ]
     columns = columns_of(path, headings, rows.units, record)
+    used, goes_back = {role: list(of_role) for role, of_role in columns.items()}, list[RejectedLine]()
     if record.long is not None:
         stamps = pd.Series(time, frame.index)
         # A connection that is lost without a time was lost after the line before.
         stamps = stamps.fillna(stamps.ffill().where(lost))
         lines = pd.DataFrame({"time": stamps, "channel": of_lines, "value": numbers})
-        used = {role: list(of_role) for role, of_role in columns.items()}
-        frame, time, held, without_number = _by_channel(path, frame, lines, lost, used, record.long)
-        left_out += without_number
+        # camonitor prints the value of a channel without a reading as 0, with the severity of its alarm behind it.
+        beside = frame.drop(columns=[record.long.value, record.long.channel, *record.long.time])
+        invalid = beside.isin(["INVALID"]).any(axis=1)
+        lines["value"] = lines["value"].mask(invalid | lost)
+        taken = lines["channel"].isin([name for of_role in used.values() for name in of_role]) & lines["time"].notna()
+        left_out += [
+            RejectedLine(
+                path.name,
+                int(line),
+                str(frame.at[line, record.long.value]),
+                "is INVALID" if invalid[line] else "is not a number",
+            )
+            for line in lines.index[taken & lines["value"].isna() & ~lost]
+        ]
+        not_connected = [f"{name} (line {line})" for line, name in lines["channel"][lost].items()]
+        frame, time, held = _by_channel(path, lines[taken], not_connected, used)
+    else:
+        timed = ~np.isnat(time)
+        goes_back = tables.where_clock_goes_back(path, frame.index[timed], time[timed])
+        if len(apart := _lines_apart(frame, time, used)):
+            frame, time, held = _by_channel(path, apart, [], used)
     keep = ~np.isnat(time)
-    goes_back = [] if record.long is not None else tables.where_clock_goes_back(path, frame.index[keep], time[keep])
     order = np.argsort(time[keep], kind="stable")
 
     def block(role: str, unit: str | None) -> tuple[list[str], list[str], np.ndarray]:
@@ -754,27 +774,28 @@ def numbers_in(column: pd.Series) -> np.ndarray:
     return np.array([number(text) for text in texts])
 
 
+def _lines_apart(frame: pd.DataFrame, time: np.ndarray, used: Mapping[str, list[str]]) -> pd.DataFrame:
+    """Return time, channel and value of a table that holds its channels on rows apart, as several loggers' rows one below the other by
+    their times are; empty where rows hold all of them, or a channel ends.
+    """
+    names = [name for role in ("temperature", "displacement", "driver") for name in used[role]]
+    numbers = pd.DataFrame({name: numbers_in(frame[name]) for name in names}, frame.index)[~np.isnat(time)]
+    felt = numbers[[*used["temperature"], *used["displacement"]]].notna()
+    stretches = np.array_split(felt.to_numpy(), min(_STRETCHES, len(felt)))
+    if felt.all(axis=1).mean() > _TOGETHER or not (
+        all(one.any(axis=0).all() for one in stretches) and numbers.notna().any().all()
+    ):
+        return pd.DataFrame()
+    lines = numbers.assign(time=time[~np.isnat(time)]).melt("time", var_name="channel", ignore_index=False)
+    return lines.dropna(subset="value").sort_values("time", kind="stable")
+
+
 def _by_channel(
-    path: Path,
-    frame: pd.DataFrame,
-    lines: pd.DataFrame,
-    lost: pd.Series,
-    used: Mapping[str, list[str]],
-    long: LongTable,
-) -> tuple[pd.DataFrame, np.ndarray, list[dict[str, Any]], list[RejectedLine]]:
-    """Return a column for every channel that is used, its times, how values were held between lines, and lines without a number."""
-    # camonitor prints the value of a channel without a reading as 0, with the severity of its alarm behind it.
-    invalid = frame.drop(columns=[long.value, long.channel, *long.time]).isin(["INVALID"]).any(axis=1)
-    lines["value"] = lines["value"].mask(invalid | lost)
-    not_connected = [f"{name} (line {line})" for line, name in lines["channel"][lost].items()]
-    lines = lines[lines["channel"].isin([name for names in used.values() for name in names]) & lines["time"].notna()]
-    bad = lines.index[lines["value"].isna() & ~lost[lines.index]]
-    left_out = [
-        RejectedLine(
-            path.name, int(line), str(frame.at[line, long.value]), "is INVALID" if invalid[line] else "is not a number"
-        )
-        for line in bad
-    ]
+    path: Path, lines: pd.DataFrame, not_connected: list[str], used: Mapping[str, list[str]]
+) -> tuple[pd.DataFrame, np.ndarray, list[dict[str, Any]]]:
+    """Return a column for every channel from lines of time, channel and value, the times of its rows, and how values were held between
+    lines.
+    """
     described: dict[str, Any] = {"file": path.name, "lost": not_connected}
     # A value goes before an alarm of the same time.
     each = {str(name): of_one.groupby("time")["value"].last() for name, of_one in lines.groupby("channel")}
@@ -788,7 +809,7 @@ def _by_channel(
     # Between two lines of the displacement that is logged most often nothing is measured that could be explained.
     fastest = min((name for name in used["displacement"] if name in usual), key=usual.__getitem__, default="")
     if wide.notna().all(axis=None) or not fastest:
-        return wide, wide.index.to_numpy("M8[ns]"), [described] if not_connected else [], left_out
+        return wide, wide.index.to_numpy("M8[ns]"), [described] if not_connected else []
     at_all = np.unique(np.concatenate(list(seconds.values())))
     start, end = seconds[fastest][0], at_all[-1]
     # Bursts and long pauses: no more rows than lines.
@@ -802,7 +823,7 @@ def _by_channel(
     waits = {name: float(np.diff(at).max(initial=0.0)) for name, at in seconds.items()}
     slowest = max(waits, key=waits.__getitem__)
     described |= {"step_s": step_s, "longest_s": longest_s, "fastest": fastest, "slowest": slowest, "wait_s": waits[slowest]}  # fmt: skip
-    return pd.DataFrame(held)[kept], (first + np.round(grid * 1e9).astype("m8[ns]"))[kept], [described], left_out
+    return pd.DataFrame(held)[kept], (first + np.round(grid * 1e9).astype("m8[ns]"))[kept], [described]
 
 
 def _usual_step_s(seconds: Array) -> float:

@@ -175,6 +175,22 @@ def test_values_are_held_between_their_changes(tmp_path: Path, by_hand: xr.Datas
     assert np.all(np.abs(data["displacement"].values - by_hand["displacement"].values[rows_of]) <= 0.6 + 4 * drift[0])
 
 
+def test_rows_of_one_logger_each_are_held_until_its_next(tmp_path: Path, by_hand: xr.Dataset) -> None:
+    """Two loggers' rows one below the other, as pandas writes lines of JSON; a channel that ends early is not held."""
+    lines = ["time,T1 [degC],T2 [degC],Z [mm]"]
+    for k, stamp in enumerate(STAMPS):
+        lines += [f"{stamp},,,{NOSE[k]}"] + [f"{stamp + 7},{SPINDLE[k]},{BEARING[k]},"] * (k % 4 == 0)
+    data = drafted(tmp_path / "apart", "\n".join(lines), "apart.csv")
+    assert data.sizes["time"] == MINUTES.size and json.loads(data.attrs["held"])[0]["fastest"] == "Z [mm]"
+    assert np.nanmax(np.abs(data["displacement"].values - by_hand["displacement"].values)) < 1e-9
+    # Until the next one, two minutes later, a temperature stays.
+    errors = np.abs(data["temperature"].values - by_hand["temperature"].values)
+    assert np.isnan(errors).any(axis=1).sum() <= 1 and np.nanmax(errors) < 2.2 * 8 / 40
+    ended = [line for k, line in enumerate(lines) if k < len(lines) / 2 or ",,," in line]
+    data = drafted(tmp_path / "ended", "\n".join(ended), "ended.csv")
+    assert json.loads(data.attrs["held"]) == []
+
+
 def test_a_displacement_that_looks_like_a_temperature_is_asked_for(tmp_path: Path) -> None:
     text = rows("{n}.25  {t1}  {t2}").replace("3000.25", "30.25").replace("1500.25", "28.5")
     data = drafted(tmp_path / "folder", text, "log.txt", {"Column of the displacement": "1 = displacement um"})
