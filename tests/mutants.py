@@ -54,6 +54,11 @@ _ALSO = {
         "tests/fusion/campaign/test_columns.py::test_days_counted_from_a_date_are_told_by_their_numbers_and_marked[datenum-719529]",
         "tests/fusion/campaign/test_keys.py",
     ),
+    # What every surface says, and the words of every check.
+    "fusion/report/wording.py": (
+        "tests/fusion/report/test_findings.py",
+        "tests/fusion/analysis/consistency/test_every_check.py",
+    ),
     # The end of the search, and the scorer of candidates.
     "fusion/analysis/drift_model/search.py": ("tests/fusion/analysis/drift_model/test_evaluation.py",),
     "fusion/analysis/drift_model/admissibility.py": ("tests/fusion/analysis/drift_model/test_gains.py",),

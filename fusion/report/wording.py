@@ -447,7 +447,7 @@ def by_effect(parts: Iterable[DriftShare]) -> list[DriftShare]:
 
 def whole_percent(share: float) -> str:
     """Return a share of 1 in whole per cent, without one that only rounding makes 0 or 100."""
-    return "less than 1 %" if share < 0.005 else "more than 99 %" if share > 0.995 else f"{100 * share:.0f} %"
+    return "less than 1 %" if share <= 0.005 else "more than 99 %" if share >= 0.995 else f"{100 * share:.0f} %"
 
 
 def worse_channels(loop: Loop) -> list[tuple[str, ChannelErrors]]:

@@ -15,6 +15,7 @@ from fusion.results import numbers
 from fusion.results.axis import (
     AnomalyPart,
     CorrelationPart,
+    DriftPart,
     DutyPart,
     Evidence,
     Iso230Part,
@@ -151,7 +152,53 @@ def test_parameters_are_words_with_units_and_the_range_that_fits_as_well():
         {"sensor": "head_1_K", "start": "not_free"}, {"sensor": ("b_mm", "c"), "start": ("is_free",)}
     )
     assert told == "sensor head_1_K (or b_mm and c), start not free (or is free)"
+    told = wording.parameters(
+        {"time_s": 90, "wave_um": 1.0, "tau_min": 2.0}, {"time_s": (60.0, 120.0), "tau_min": (None, 3.0)}
+    )
+    assert told == "90 s after the start (60 s to 2 min), wave 1.00 µm, tau 2.00 min (at most 3.00)"
+    assert (
+        wording.parameters({"time_s": "late", "b_s": 1}, {"b_s": (None, None)}) == "time late s, b 1 s (not determined)"
+    )
     assert wording.in_words([1.0, True, None, "warm_up"]) == "1.00, yes, – and warm up"
+    assert wording.limited(5.0, (4.9, 5.3), "µm") == "5.00 [4.90 to 5.30] µm"
+    assert wording.limited(5.0, (None, 5.1), "µm") == "5.00 µm" and wording.limited(None, (1.0, 2.0)) == "–"
+    assert [wording.whole_percent(share) for share in (0.005, 0.5, 0.995)] == [
+        "less than 1 %",
+        "50 %",
+        "more than 99 %",
+    ]
+
+
+def test_the_largest_and_the_smallest_range_of_the_drift_are_found_among_those_that_are_known():
+    drift = DriftPart.model_construct(
+        range_um=(None, 3.1, 11.13, 0.1), range_u_um=(None, 0.1, None, 0.17), position_mm=(0.0, 1.0, 150.0, 300.0)
+    )
+    largest, smallest = wording.drift_extremes(drift)
+    assert largest == (Quantity(value=11.13, u=None), 3, 150.0, False)
+    assert smallest == (Quantity(value=0.1, u=0.17), 4, 300.0, True)
+    assert [wording.drift_size(one) for one in (largest, smallest)] == ["11.1 µm", "below 0.34 µm"]
+
+
+@pytest.mark.parametrize(
+    ("direction", "positive", "negative", "place", "scatter"),
+    [
+        ("both", 0.6, 0.8, "position 3, both approaches", 0.5**0.5),
+        ("both", None, 0.8, "position 3, both approaches", 0.8),
+        ("both", None, None, "position 3, both approaches", None),
+        ("positive", 0.6, 0.8, "position 3, positive approach", 0.6),
+        ("negative", 0.6, None, "position 3, negative approach", None),
+    ],
+)
+def test_an_anomaly_stands_at_an_approach_with_its_scatter(direction, positive, negative, place, scatter):
+    evidence = Evidence.model_construct(scatter_positive_um=positive, scatter_negative_um=negative)
+    found = AnomalyPart.model_construct(target=3, direction=direction, evidence=evidence)
+    assert wording.anomaly_place(found) == place and wording.scatter_of(found) == pytest.approx(scatter)
+
+
+def test_several_steps_have_one_share_together():
+    steps = (("step", 0.5), ("lag", 0.25), ("step", 0.25), ("step", None))
+    parts = [DriftShare.model_construct(effect=effect, share=share) for effect, share in steps]
+    assert [(one.effect, one.share) for one in wording.by_effect(parts)] == [("step", 0.75), ("lag", 0.25)]
 
 
 def step(effect: str, **changes: Any) -> StepPart:
@@ -299,6 +346,7 @@ def test_what_predicts_no_better_than_the_mean_explains_nothing():
             {"rmse_declared_um": 0.733, "rmse_final_um": 0.737, "rmse_persistence_um": 0.41},
             ["does not fall (0.73 µm before, 0.74 µm after)", "gives 0.41 µm (less than the model"],
         ),
+        ({"rmse_declared_um": 1.0, "rmse_persistence_um": 1.0}, ["gives 1.00 µm, the"]),
         ({"rmse_persistence_um": 1.0}, ["gives 1.00 µm (less than the declared model alone)"]),
         (
             {"rmse_persistence_um": 0.9},
