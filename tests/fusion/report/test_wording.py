@@ -1,9 +1,12 @@
 """Numbers, places, tables and findings: digits follow the uncertainty, conditions stand where a doubt touches a figure."""
 
+import io
+import re
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from fusion.pipeline.consistency import inputs_part
 from fusion.report import findings as answers
@@ -160,7 +163,7 @@ def test_parameters_are_words_with_units_and_the_range_that_fits_as_well():
         wording.parameters({"time_s": "late", "b_s": 1}, {"b_s": (None, None)}) == "time late s, b 1 s (not determined)"
     )
     assert wording.in_words([1.0, True, None, "warm_up"]) == "1.00, yes, – and warm up"
-    assert wording.limited(5.0, (4.9, 5.3), "µm") == "5.00 [4.90 to 5.30] µm"
+    assert wording.limited(5.0, (4.97, 5.03), "µm") == "5.000 [4.970 to 5.030] µm"
     assert wording.limited(5.0, (None, 5.1), "µm") == "5.00 µm" and wording.limited(None, (1.0, 2.0)) == "–"
     assert [wording.whole_percent(share) for share in (0.005, 0.5, 0.995)] == [
         "less than 1 %",
@@ -191,8 +194,23 @@ def test_the_largest_and_the_smallest_range_of_the_drift_are_found_among_those_t
 )
 def test_an_anomaly_stands_at_an_approach_with_its_scatter(direction, positive, negative, place, scatter):
     evidence = Evidence.model_construct(scatter_positive_um=positive, scatter_negative_um=negative)
-    found = AnomalyPart.model_construct(target=3, direction=direction, evidence=evidence)
+    found = AnomalyPart.model_construct(target=3, direction=direction, evidence=evidence, cause="undetermined")
     assert wording.anomaly_place(found) == place and wording.scatter_of(found) == pytest.approx(scatter)
+    assert wording.figures_of_anomalies([found]) == ["positions"]
+    warm = found.model_copy(update={"cause": "local_temperature"})
+    assert wording.figures_of_anomalies([found, warm]) == ["field", "positions"]
+
+
+def test_a_table_is_printed_without_its_columns_of_dashes():
+    whole = wording.table(
+        [wording.Words("place"), "size", "none"], [["a", "1", "–"], wording.Row(["b–", "–", "–"], marked=True)]
+    )
+    shown = wording.with_values(whole)
+    assert shown.titles == ("place", "size") and [row.marked for row in shown.rows] == [False, True]
+    console = Console(width=40, file=io.StringIO(), color_system=None)
+    console.print(wording.print_table(shown, "T"))
+    cells = [re.split(r"[│┃]", line)[1:3] for line in console.file.getvalue().splitlines() if line[0] in "│┃"]
+    assert cells == [[" place ", " size "], [" a     ", "    1 "], [" b–    ", "    – "]]
 
 
 def test_several_steps_have_one_share_together():
@@ -368,7 +386,7 @@ def test_errors_are_compared_with_plain_repetition(changes, stated):
 def test_a_record_repeats_values_and_predicts_blocks_of_time():
     channels = {
         name: ChannelErrors.model_construct(rmse_declared_um=3.01, rmse_final_um=after)
-        for name, after in (("ch1", 2.0), ("ch2", 3.21))
+        for name, after in (("ch1", 2.0), ("ch2", 3.21), ("ch3", 3.01))
     }
     lagging = loop("explained", step("thermal_lag", rms_um=0.4), held_out="37.0 h to 46.3 h held out; x")
     told = {**vars(lagging), "channels": channels}
