@@ -59,6 +59,11 @@ _ALSO = {
         "tests/fusion/report/test_findings.py",
         "tests/fusion/analysis/consistency/test_every_check.py",
     ),
+    # Every check once passed and once not.
+    **dict.fromkeys(
+        ("fusion/analysis/consistency/camera.py", "fusion/analysis/consistency/deviations.py"),
+        ("tests/fusion/analysis/consistency/test_every_check.py",),
+    ),
     # The end of the search, and the scorer of candidates.
     "fusion/analysis/drift_model/search.py": ("tests/fusion/analysis/drift_model/test_evaluation.py",),
     "fusion/analysis/drift_model/admissibility.py": ("tests/fusion/analysis/drift_model/test_gains.py",),
