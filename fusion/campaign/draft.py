@@ -310,7 +310,7 @@ def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterato
     yield from _optional("lens", content, Kind.LENS)
     yield from ("", "[thermography.stack]                     # temperatures of another camera: docs/formats.md")
     if values.dtype.kind in "iu":
-        yield _line(known["scale"], TO_FILL)
+        yield _line(known["scale"], asker.value(known["scale"]) or TO_FILL)
     if not contents.unit:
         middle = float(np.nanmedian(values))
         units = tuple(sorted(("degC", "K"), key=("K" if middle > _WARMEST_DEGC else "degC").__ne__))

@@ -109,6 +109,8 @@ _LIQUID_AIR_K = 79.0
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
 #: What a line that sums up those above it is called.
 _SUMMARY = re.compile(rf"(?<![^\W\d_])({'|'.join(vocabulary('columns')['summaries'])})(?![^\W\d_])", re.IGNORECASE)
+#: Texts by which a log of changes says that a channel gives no value any more.
+_NOT_CONNECTED = vocabulary("columns")["not_connected"]
 #: Most lines of a table that sum it up.
 _MOST_SUMMARIES = 5
 #: Where seconds count from in a table whose start is not stated.
@@ -256,7 +258,9 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
     if record.long is not None:
         # camonitor prints "*** Disconnected" or "*** Not connected (PV not found)" in place of a value, or of the time as well.
         written = frame[frame.columns.intersection([*record.long.time, record.long.value])].apply(stripped)
-        lost = written.apply(lambda column: column.str.startswith("***")).any(axis=1)
+        lost = written.apply(
+            lambda column: column.str.startswith("***") | column.str.casefold().isin(_NOT_CONNECTED)
+        ).any(axis=1)
         for heading in (record.long.channel, record.long.value):
             _find(path, heading, frame)
     time, reference, left_out = read_times(path, rows, record, record.time or (record.long.time if record.long else ()))

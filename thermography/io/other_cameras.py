@@ -385,6 +385,31 @@ class TiffReader(TemperatureReader):
             return np.where(values == page.nodata, np.nan, values) if "GDAL_NODATA" in page.tags else values
 
 
+class PngReader(TemperatureReader):
+    """Reader of PNG with one grey value of 16 bits per pixel, with a stated scale; of 8 bits or colours it is a photo or a chart."""
+
+    name = "PNG of 16 bits"
+    starts = (b"\x89PNG\r\n\x1a\n",)
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether the header states 16 bits of grey."""
+        return super().recognises(path, start) and start[24:26] == b"\x10\0"
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return size of the picture, as its header states it."""
+        width, height = struct.unpack(">II", path.read_bytes()[16:24])
+        _require_scale(path, np.dtype("u2"), options)
+        return StackContents(1, (height, width))
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the counts, (row, column)."""
+        from PIL import Image
+
+        self.frame_contents(path, options)
+        with _refused(f"{path}: damaged PNG", "export it again"), Image.open(path) as picture:
+            return np.asarray(picture)
+
+
 def _state(path: Path) -> tuple[int, int]:
     """Return size and time of change of a file: what was kept of it holds as long as they are the same."""
     status = path.stat()
@@ -1045,7 +1070,16 @@ def plug_ins() -> tuple[FrameReader, ...]:
 @cache
 def readers() -> tuple[FrameReader, ...]:
     """Return all readers, plug-ins first."""
-    return (*plug_ins(), FlirReader(), FpfReader(), TiffReader(), NumpyReader(), NetcdfReader(), TextReader())
+    return (
+        *plug_ins(),
+        FlirReader(),
+        FpfReader(),
+        TiffReader(),
+        PngReader(),
+        NumpyReader(),
+        NetcdfReader(),
+        TextReader(),
+    )
 
 
 def find_reader(path: Path) -> FrameReader | None:

@@ -191,6 +191,19 @@ def test_rows_of_one_logger_each_are_held_until_its_next(tmp_path: Path, by_hand
     assert json.loads(data.attrs["held"]) == []
 
 
+def test_a_state_in_place_of_a_value_ends_it(tmp_path: Path) -> None:
+    """Home Assistant's history: a sensor that is unavailable from the middle on is not held to the end."""
+    lines = ["entity_id,state,last_changed"]
+    for k, stamp in enumerate(STAMPS):
+        if k < 120:
+            lines.append(f"sensor.spindle_temperature,{SPINDLE[k] if k != 119 else 'unavailable'},{stamp}Z")
+        lines += [f"sensor.bearing_temperature,{BEARING[k]},{stamp}Z", f"sensor.nose_um,{1000 * NOSE[k]:.1f},{stamp}Z"]
+    data = drafted(tmp_path / "home", "\n".join(lines), "history.csv")
+    spindle = data["temperature"].sel(sensor="sensor.spindle_temperature").values
+    assert np.isfinite(spindle[:119]).all() and np.isnan(spindle[119:]).all()
+    assert json.loads(data.attrs["held"])[0]["lost"] and json.loads(data.attrs["left_out"]) == []
+
+
 def test_a_displacement_that_looks_like_a_temperature_is_asked_for(tmp_path: Path) -> None:
     text = rows("{n}.25  {t1}  {t2}").replace("3000.25", "30.25").replace("1500.25", "28.5")
     data = drafted(tmp_path / "folder", text, "log.txt", {"Column of the displacement": "1 = displacement um"})

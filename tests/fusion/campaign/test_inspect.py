@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import tifffile
 import xarray as xr
+from PIL import Image
 
 from fusion.campaign.inspect import (
     Kind,
@@ -136,6 +137,8 @@ SAMPLES: list[tuple[Kind, str, str | Callable[[Path], object], list[str]]] = [
     (Kind.STACK, "a.npy", lambda path: np.save(path, np.full((8, 9), 20.0)),
      ["NumPy array, 1 frame of 9 x 8", "  values of the first frame 20 to 20"]),
     (Kind.STACK, "a.tif", lambda path: tifffile.imwrite(path, np.full((8, 9), 20.0, "f4")), ["TIFF of temperatures, 1 frame of 9 x 8"]),
+    (Kind.STACK, "a.png", lambda path: Image.fromarray(np.full((8, 9), 29315, "u2")).save(path),
+     ["PNG of 16 bits, 1 frame of 9 x 8", "  values of the first frame 29315 to 29315"]),
     (Kind.STACK, "a.fpf", lambda path: public_format(path, 2, np.full((8, 9), 20.0, "f4")), ["FLIR Public Format, 1 frame of 9 x 8"]),
     (Kind.STACK, "a.nc", write_netcdf, ["NetCDF or Zarr, 2 frames of 9 x 8", "  values of the first frame 20 to 20 degC"]),
     (Kind.STACK, "a.csv", "\n".join(";".join(["20,1"] * 9) for _ in range(8)), ["text with one temperature per pixel, 1 frame of 9 x 8"]),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
+from PIL import Image
 
 from tests.thermography.flir_mutations import sequence
 from tests.thermography.plan_scene import SC660
@@ -24,6 +25,7 @@ from thermography.io.other_cameras import (
     FrameReaderError,
     NetcdfReader,
     NumpyReader,
+    PngReader,
     StackContents,
     StackError,
     StackOptions,
@@ -118,6 +120,21 @@ def test_a_tiff_whose_strips_do_not_fill_its_page_is_refused_before_memory_is_ta
     path.write_bytes(content)
     with pytest.raises(ThermographyError, match=r"a\.tif: page 0 is damaged \(.*contradict one another\); export"):
         TiffReader().read_values(path, 0, EVERY_10_S)
+
+
+def test_a_png_of_16_bits_is_a_frame_and_a_photo_is_none(tmp_path):
+    counts = np.arange(28000, 28000 + 12 * 16, dtype="u2").reshape(12, 16)
+    for name, picture in (("a", counts), ("photo", (counts // 256).astype("u1"))):
+        Image.fromarray(picture).save(tmp_path / f"{name}.png")
+    assert isinstance(find_reader(tmp_path / "a.png"), PngReader) and find_reader(tmp_path / "photo.png") is None
+    with pytest.raises(StackError, match="whole numbers of 16 bits; write the scale"):
+        index_recordings([tmp_path / "a.png"], EVERY_10_S)
+    options = StackOptions(unit="K", scale=0.01, start=TIMES[0], interval_s=10.0)
+    frames, _ = index_recordings([tmp_path / "a.png"], options)
+    np.testing.assert_allclose(frames[0].read_temperature(), counts * 0.01 - 273.15, atol=1e-9)
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
+    with pytest.raises(ThermographyError, match=r"a\.png: damaged PNG .*; export it again"):
+        PngReader().read_values(tmp_path / "a.png", 0, options)
 
 
 def test_a_tiff_whose_first_page_lies_beyond_its_end_is_refused(tmp_path):
