@@ -152,10 +152,11 @@ def _pieces(registration: Registration, grid: PlanGrid, window: tuple[slice, sli
     across, down = np.meshgrid(np.arange(columns + 1) - 0.5, np.arange(window[0].start, window[0].stop + 1) - 0.5)
     corners = registration.to_plan(np.stack([across, down], axis=-1))
     discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked]).reshape(-1, 3)
-    size = (grid.width_mm, grid.height_mm)
+    # A plan may be given in whole numbers, for which the cutting would be compiled again.
+    size, cell_mm = (float(grid.width_mm), float(grid.height_mm)), float(grid.cell_size_mm)
     with ThreadPoolExecutor(usable_threads()) as executor:
         halves = executor.map(
-            lambda part: _cut_pixels(corners, part, discs, size, grid.cell_size_mm, registration.margin_px),
+            lambda part: _cut_pixels(corners, part, discs, size, cell_mm, registration.margin_px),
             [(0, rows // 2), (rows // 2, rows)],
         )
         return tuple(np.concatenate(both) for both in zip(*halves, strict=True))
@@ -300,7 +301,7 @@ def centring_matrix(offset_mm: Array, coverage: Array, grid: PlanGrid) -> scipy.
     seen = coverage.ravel() >= LEAST_COVERAGE
     off_centre = (np.abs(offset_mm) > 0.02 * grid.cell_size_mm).any(axis=1) & seen
     rows, columns, weights = _centring_entries(
-        np.flatnonzero(off_centre), offset_mm, centres_mm, coverage.ravel(), grid.shape, grid.cell_size_mm
+        np.flatnonzero(off_centre), offset_mm, centres_mm, coverage.ravel(), grid.shape, float(grid.cell_size_mm)
     )
     return scipy.sparse.csr_array((weights, (rows, columns)), shape=(seen.size, seen.size))
 
