@@ -114,7 +114,7 @@ def test_a_model_beside_a_table_goes_on_after_a_restart_and_rests_when_a_sensor_
     readings = [[20.5, 21.0, 0.0], [22.0, 21.5, 0.0], [24.0, 22.0, 6000.0], [26.0, 21.0, 6000.0], [26.0, 0.0, 6000.0]]
 
     def run(more: str, rows: list[list[float]]) -> list[list[float]]:
-        return control(place, files, hal + more, {"moves": [50.0], "readings": rows, "settle_s": 4.0})["followed"]
+        return control(place, files, hal + more, {"moves": [50.0], "readings": rows, "settle_s": 2.0})["followed"]
 
     def stated(log: list[list[float]], rows: list[list[float]], **start) -> list[float]:
         """Corrections at the end of each reading by the model's description."""

@@ -51,7 +51,7 @@ moved = []
 for x in asked["moves"]:
     command.mdi(f"G0 X{x}")
     command.wait_complete(20)
-    time.sleep(0.3)
+    time.sleep(0.1)
     moved.append([x, pin("joint.0.pos-cmd"), pin("joint.0.motor-pos-cmd"), pin("joint.0.motor-offset")])
 followed = []
 if asked["readings"]:
