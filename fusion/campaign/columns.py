@@ -37,7 +37,7 @@ from interferometry.io.spreadsheets import cell_text, is_workbook
 from thermofuse.resources import by_word, vocabulary
 from thermofuse.units import SHARE, find_unit
 
-_VOCABULARY = vocabulary("columns")
+_VOCABULARY = vocabulary("logs")
 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")

@@ -74,7 +74,7 @@ _OFFSET = re.compile(r"(?<!\d)([+-]\d\d):?(\d\d)")
 #: Heading of the milliseconds beside a time.
 _MILLISECONDS = re.compile(r"ms(ec)?|milliseconds?|sub ?sec", re.IGNORECASE)
 #: Names of columns that hold a part of a time each -> the part.
-PARTS = by_word(vocabulary("columns")["parts"])
+PARTS = by_word(vocabulary("logs")["parts"])
 #: Counters of loggers, in bits, and the largest step over which they are seen to begin again, in usual steps.
 _COUNTERS, _LARGEST_STEP = (16, 32), 2.0
 #: A heading in quotes that goes on in the next line, as Excel's Alt+Enter writes it, and the most lines of such headings.
@@ -108,9 +108,9 @@ _LIQUID_AIR_K = 79.0
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
 #: What a line that sums up those above it is called.
-_SUMMARY = re.compile(rf"(?<![^\W\d_])({'|'.join(vocabulary('columns')['summaries'])})(?![^\W\d_])", re.IGNORECASE)
+_SUMMARY = re.compile(rf"(?<![^\W\d_])({'|'.join(vocabulary('logs')['summaries'])})(?![^\W\d_])", re.IGNORECASE)
 #: Texts by which a log of changes says that a channel gives no value any more.
-_NOT_CONNECTED = vocabulary("columns")["not_connected"]
+_NOT_CONNECTED = vocabulary("logs")["not_connected"]
 #: Most lines of a table that sum it up.
 _MOST_SUMMARIES = 5
 #: Where seconds count from in a table whose start is not stated.

@@ -50,7 +50,7 @@ _YEARS = (1900, 2199)
 
 _MONTHS = {name: month for month, names in enumerate(_VOCABULARY["months"], start=1) for name in names}
 #: Zones by their short names, as +hhmm, and such a name in a heading, of UTC with hours and minutes.
-_ZONES: Mapping[str, str] = vocabulary("columns")["zones"]
+_ZONES: Mapping[str, str] = vocabulary("logs")["zones"]
 _NAMES_OF_ZONES = "|".join(_ZONES)
 _IN_ZONE = re.compile(rf"(?<![^\W_])({_NAMES_OF_ZONES})(?:\s*([+-]\d\d?)(?::?(\d\d))?)?(?![^\W_])")
 _ZONE = rf"(?P<zone>Z|(?:{_NAMES_OF_ZONES})?[+-]\d\d(?::?\d\d)?|{_NAMES_OF_ZONES})?"

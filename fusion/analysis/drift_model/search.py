@@ -81,7 +81,7 @@ WITHDRAWN = FINAL | {Reason.TOO_MANY_EVENTS, Reason.UNLOGGED_LOAD, Reason.OWN_CO
 WITHHELD = (BLOCKING - {Reason.COLLINEAR, Reason.WITHIN_DIGITS}) | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED}
 
 #: Return a sentence of decisions, names withheld and answers, with the numbers and names behind it.
-say = partial(sentence, "decisions")
+say = partial(sentence, "closed_loop")
 
 
 @dataclass(frozen=True)

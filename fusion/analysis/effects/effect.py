@@ -237,7 +237,7 @@ _LEAST_PLACES = 3
 
 
 #: Return why an effect cannot be tried, or cannot be told from another.
-lacks = partial(sentence, "decisions", "lacks")
+lacks = partial(sentence, "closed_loop", "lacks")
 
 
 def warm_up(readings: Readings, minutes: float) -> Array:

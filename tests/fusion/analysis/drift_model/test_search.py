@@ -326,7 +326,7 @@ def test_every_reason_is_decided_with_the_fields_of_its_sentence():
     for path in Path(fusion.__file__).parent.rglob("*.py"):
         for reason, names in decided(ast.parse(path.read_text(encoding="utf-8"))):
             raised[reason] += 1
-            asked = {name for _, name, _, _ in Formatter().parse(vocabulary("decisions")["decision"][reason]) if name}
+            asked = {name for _, name, _, _ in Formatter().parse(vocabulary("closed_loop")["decision"][reason]) if name}
             assert names >= asked, f"{path.name}: {reason}"
     assert all(raised.values()), raised
 
