@@ -434,7 +434,7 @@ def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str
     # Names may be blank above the second of two columns.
     over = [(line, fields) for line, fields in rows[:first] if line < above[-1][0] and sum(map(bool, fields)) > 1]
     # Names do not repeat, as degC above every thermocouple does.
-    repeats = any(map(is_unit, given)) and len(set(given)) < len(given)
+    repeats = sum(map(is_unit, given)) > 1 and len(set(given)) < len(given)
     if over and (repeats or 2 * sum(map(is_unit, given)) >= len(given)):
         header |= {"names": over[-1][0], "units": above[-1][0]}
     elif over and _is_over(over[-1][1], above[-1][1]):

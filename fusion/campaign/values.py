@@ -46,7 +46,7 @@ _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 _WITHIN = re.compile(r"[\[(]([^\[\]()]+)[\])](?!\.\d+$)")
 #: The same as ISO 80000 writes it, ``"T1 / °C"``; without spaces of a time alone, as m/s is a unit.
 _QUOTIENT = re.compile(
-    r"\s*(?:(.+?)(?:\s+/\s+|,\s*|\s+in\s+)|(t|time|zeit)/|(time|zeit|timestamp|elapsed)_(?=m?s|min|h))(\S.*?)\s*",
+    r"\s*(?:(.+?)(?:\s+/\s+|,\s*|\s+in\s+)|(t|time|zeit)/|(time|zeit|timestamp|elapsed|(?-i:t))_(?=m?s|min|h))(\S.*?)\s*",
     re.IGNORECASE,
 )
 #: A number and the unit beside it.

@@ -65,6 +65,8 @@ _NAMED = re.compile(
     rf"(?P<a>\d{{1,2}}|[^\W\d]+)[.\s-]+(?P<b>\d{{1,2}}|[^\W\d]+)[.,\s-]+(?P<c>\d{{4}}|\d{{2}})[,T\s-]+{_CLOCK}"
 )
 _CHINESE = re.compile(rf"(?P<a>\d{{4}})年(?P<b>\d{{1,2}})月(?P<c>\d{{1,2}})日\s*{_CLOCK}")
+#: A time of day before its date.
+_CLOCK_FIRST = re.compile(r"(\d{1,2}:\d\d(?::\d\d(?:[.,]\d+)?)?(?:\s*[AaPp]\.?[Mm]\.?)?),?\s+(\d{1,4}\s*[./-].*\d)")
 #: A time of day or an elapsed one, with days before it.
 _OF_DAY = (
     r"^(?:(?P<days>\d{1,4})(?:[.:](?=\d\d:\d\d:\d\d)|\s*d(?:ays?)?,?\s*))?(?P<hour>\d{1,5}):(?P<minute>[0-5]\d)(?::(?P<second>[0-5]\d))?"
@@ -111,7 +113,7 @@ def possible_dates(text: str) -> dict[str, date]:
 
     With dots the day is first, or the year where that is the later date: 26.03.09.
     """
-    match = _NUMERIC.fullmatch(text.strip())
+    match = _NUMERIC.fullmatch(_date_first(text))
     if match is None or len(match["a"]) == 4:
         return {}
     numbers, found = (match["a"], match["b"], match["c"]), dict[str, date]()
@@ -123,6 +125,13 @@ def possible_dates(text: str) -> dict[str, date]:
         if len(found) > 1 and found["year first"] < found["day first"]:
             del found["year first"]
     return found
+
+
+def _date_first(text: str) -> str:
+    """Return a time with its date before its time of day, without spaces around it."""
+    stripped = text.strip()
+    match = _CLOCK_FIRST.fullmatch(stripped)
+    return f"{match[2]} {match[1]}" if match else stripped
 
 
 def _either(possible: Mapping[str, date]) -> str:
@@ -147,7 +156,7 @@ def _year(text: str) -> int:
 
 def parse_time(text: str, order: DateOrder | None = None) -> tuple[np.datetime64, str]:
     """Return a time in UTC (without a zone it is taken as UTC) and its zone as +hhmm, "" where the text has none; raises `BadReading`."""
-    stripped = text.strip()
+    stripped = _date_first(text)
     try:
         stamp = datetime.fromisoformat(stripped)
     except ValueError:

@@ -471,7 +471,7 @@ def test_a_clock_that_goes_back_is_refused_unless_single_rows_are_out_of_place(
             ("ms", 1e-3), ("msec", 1e-3), ("1/100 s", 1e-2), ("s", 1), ("sek", 1), ("ks", 1e3), ("min", 60), ("Stunden", 3600),
             ("h", 3600), ("day", 86400), ("days", 86400), ("d", 86400), ("weeks", 604800),
         )),
-        ("t / s", 1.0), ("t/h", 1 / 3600.0), ("Zeit / min", 1 / 60.0),
+        ("t / s", 1.0), ("t/h", 1 / 3600.0), ("Zeit / min", 1 / 60.0), ("t_s", 1.0),
     ],
 )  # fmt: skip
 def test_a_stated_unit_of_time_is_read(tmp_path: Path, heading: str, times: float) -> None:

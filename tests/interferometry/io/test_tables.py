@@ -84,6 +84,7 @@ def test_times_of_every_spelling_become_utc_and_zones_are_not_mixed():
     assert parse_time("2026-03-09T06:30:05+01:00") == (np.datetime64("2026-03-09T05:30:05"), "+0100")
     assert parse_time("2026-03-09T06:30:05") == (np.datetime64("2026-03-09T06:30:05"), "")
     assert parse_time("9.3.2026 12:30:05 AM")[0] == np.datetime64("2026-03-09T00:30:05")
+    assert parse_time("6:30:05 PM, 3/13/2026")[0] == np.datetime64("2026-03-13T18:30:05")
     assert parse_time("9.3.2026 6:30 pm")[0] == np.datetime64("2026-03-09T18:30:00")
     assert parse_time("9.3.2026 6:30:05,25")[0] == np.datetime64("2026-03-09T06:30:05.25")
     assert parse_time("9.3.2026 6:30:05 +02:00") == (np.datetime64("2026-03-09T04:30:05"), "+0200")
