@@ -14,6 +14,7 @@ import xarray as xr
 
 from fusion.analysis.consistency import RULES
 from fusion.analysis.consistency.camera import (
+    compare_phase,
     file_warnings,
     find_gaps,
     gap_words,
@@ -21,6 +22,7 @@ from fusion.analysis.consistency.camera import (
     zero_share,
 )
 from fusion.analysis.consistency.checks import Inputs
+from fusion.analysis.consistency.clocks import QUARTERS
 from fusion.analysis.consistency.series import Motion
 from fusion.pipeline.consistency import Check, _worded, run_checks
 from fusion.results.axis import RegistrationPart
@@ -168,6 +170,13 @@ def test_a_camera_on_its_own_timer_tells_nothing(interval_s: float) -> None:
     assert all("cannot be tested" in check.evidence for check in found)
 
 
+def test_the_place_in_the_cycle_tells_how_late_the_camera_is() -> None:
+    test = recorded()
+    (found,) = compare_phase(Motion.of(test.fields["time"].values + np.timedelta64(1, "h"), test.deviations))
+    told = dict(zip(QUARTERS, found.cost, strict=True))
+    assert told[0] == 2.0 and told[4] == 0.0, "all frames away, twice the limit; none where an hour is taken off"
+
+
 def test_few_cycles_tell_nothing() -> None:
     test = recorded()
     short = test.deviations.isel(cycle=slice(0, 8))
@@ -210,7 +219,7 @@ def test_renamed_files_are_no_fault_of_the_clock(campaign_folder: Path) -> None:
     shuffled = np.random.default_rng(3).permutation(seconds)
     two_exchanged = seconds.copy()
     two_exchanged[[7, 32]] = seconds[[32, 7]]
-    for renamed in (shuffled, two_exchanged):
+    for renamed in (shuffled, shuffled**1.5, two_exchanged):
         check = check_order(numbered(renamed, like))
         assert check.passed and "the times were taken" in check.evidence
     set_back = seconds - np.where(np.arange(40) >= 20, 600.0, 0.0)
@@ -303,6 +312,8 @@ def test_readings_in_a_gap_between_frames_are_counted() -> None:
     assert not check.passed and check.value == 0.25
     assert "42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z" in check.evidence
     assert [gap_words(gap) for gap in find_gaps(kept)] == ["42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z"]
+    # Three intervals are not longer than three.
+    assert not find_gaps(np.delete(dataset["time"].values, [14, 15]))
     (alone,) = run_checks("fields", Inputs(frame_time=kept[:1], reading_time=readings))
     assert alone.passed
 
