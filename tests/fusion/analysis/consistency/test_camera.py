@@ -268,7 +268,8 @@ def doubted_places(dataset: xr.Dataset) -> dict[str, Check]:
 
 def test_a_common_step_of_the_camera_is_no_jump_of_a_part() -> None:
     step = np.where(np.arange(FRAMES) < 20, 0.0, 0.8)[:, None, None]
-    assert doubted_places(fields(step)) == {}
+    # A third of all frames may be left out: 20 of 60.
+    assert doubted_places(fields(step, frames_damaged=["a.jpg#0"] * 20)) == {}
 
 
 def test_a_long_stretch_without_a_check_is_doubted_and_named() -> None:
@@ -357,16 +358,16 @@ def test_a_sound_registration_is_not_doubted():
 
 @pytest.mark.parametrize(("zero_u_K", "passed"), [(0.2, True), (0.8, False)])
 def test_a_zero_that_may_be_more_than_a_third_of_the_rise_is_doubted(zero_u_K: float, passed: bool) -> None:
-    rise = np.linspace(0.0, 2.0, 5)
+    rise = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 9.0])
     shown = {"pattern_K": 0.02, "disc": "F3", "zero_K": 0.6, "warming_K": 2.5}
     fields = xr.Dataset(
         {
             "temperature_rise": (("cycle", "y", "x"), rise[:, None, None] * np.ones((1, 2, 2))),
-            "camera_correction_u": ("cycle", np.full(5, zero_u_K)),
+            "camera_correction_u": ("cycle", [*[zero_u_K] * 5, np.nan]),
         },
         attrs={"discs": json.dumps(shown)},
     )
-    share = zero_u_K / np.sqrt(np.mean(rise**2))
+    share = zero_u_K / np.sqrt(np.mean(rise[:5] ** 2))
     assert zero_share(fields) == pytest.approx(share)
     _, zero = of_fields(fields)
     assert zero.passed is passed and "reference_patch" in zero.remedy and zero.verified is not zero.passed

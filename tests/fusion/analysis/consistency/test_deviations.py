@@ -199,7 +199,7 @@ def test_one_approach_alone_and_missing_readings_pass() -> None:
     values = test["deviation"].values.copy()
     values[:, 1] = np.nan
     values[3, 0, 4] = np.nan
-    assert failed(with_deviation(test, values)) == {}
+    assert failed(with_deviation(test, values)) == {} == failed(test.isel(direction=[0]))
 
 
 def test_only_what_lies_far_beyond_the_scatter_of_its_own_position_is_an_error_of_reading() -> None:
@@ -227,6 +227,20 @@ def test_a_jump_of_some_targets_or_a_small_slip_is_no_new_datum() -> None:
     some["deviation"][20:, :, 6:] += 20.0
     small["deviation"][20:] += 3.0
     assert not failed(some) and not failed(small)
+
+
+@pytest.mark.parametrize(("part_um", "first"), [(20.0, 22), (60.0, 21)])
+def test_a_cycle_within_which_the_datum_changes_belongs_to_the_nearer_level(part_um: float, first: int) -> None:
+    test = sound()
+    test["deviation"][20] += part_um
+    test["deviation"][21:] += 80.0
+    assert f"From cycle {first} on all targets read +80." in failed(test)["datum"].evidence
+
+
+def test_of_many_copies_five_are_named() -> None:
+    values = sound()["deviation"].values.copy()
+    values[20:24] = values[19]
+    assert "20 and 24, 21 and 22 and 5 more agree" in failed(with_deviation(sound(), values))["copied_cycles"].evidence
 
 
 def test_targets_that_are_always_at_the_limit_are_clipped_and_not_zeroed() -> None:
