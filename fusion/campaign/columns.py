@@ -713,6 +713,9 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         of_unit = role_of_unit(unit)
         if role in ("temperature", "displacement") and _RATE.fullmatch(unit) and not is_unit(unit):
             return replace(known, remark="a rate")
+        if of_unit == "temperature" and low == high and numbers.size > logs.HEAD:
+            # What a logger writes for a sensor that is not there, and nothing that a drift could follow.
+            return replace(known, remark="constant")
         if of_unit == "displacement" and (high - low) * column_conversion(unit, "mm")[0] > _FARTHEST_MM:
             return replace(known, remark=f"moves farther than {_FARTHEST_MM:g} mm: no thermal displacement")
         if of_unit == "driver" and not is_unit(unit) and role != "driver":

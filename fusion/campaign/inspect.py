@@ -116,8 +116,8 @@ def _describe_maps(path: Path) -> Iterator[str]:
 
 #: Bytes that are read to tell the kind of a text, and lines that tell a list of pixels.
 _START, _LOOKED_INTO_LINES = 65_536, 8
-#: Longest reason why a file is not understood, characters.
-_LONGEST_REASON = 160
+#: Longest reason why a file is not understood, characters: with a line of the file and the remedy.
+_LONGEST_REASON = 480
 _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
 _RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
 #: Units of the temperatures and of the displacements of a record.
@@ -451,15 +451,19 @@ def _course(times: NDArray[np.datetime64], reference: str, noun: str) -> Iterato
     if timed.size == 0:
         return
     length = duration(float((timed[-1] - timed[0]) / np.timedelta64(1, "s")))
+    zone = "" if reference == NO_ZONE else None
+
+    def at(time: np.datetime64) -> str:
+        dated = timed[0] >= DATED
+        return moment(time, zone) if dated else f"{time.astype('M8[ns]').astype(np.int64) / 1e9:.10g} s"
+
     if timed[0] < DATED:
-        first, last = (f"{time.astype('M8[ns]').astype(np.int64) / 1e9:.10g} s" for time in timed[[0, -1]])
-        yield f"{first} to {last} after a start that is not stated, {length}"
+        yield f"{at(timed[0])} to {at(timed[-1])} after a start that is not stated, {length}"
     else:
-        zone = "" if reference == NO_ZONE else None
-        yield f"{moment(timed[0], zone)} to {moment(timed[-1], zone)}, {length}, {reference}"
+        yield f"{at(timed[0])} to {at(timed[-1])}, {length}, {reference}"
     if timed.size > 1:
         gaps = [
-            f"{moment(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
+            f"{at(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
             for (_, end), (start, _) in itertools.pairwise(Recording("", timed).stretches())
         ]
         step_s = float(np.median(np.diff(timed).astype("m8[ns]").astype(np.int64))) * 1e-9

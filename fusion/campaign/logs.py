@@ -85,7 +85,7 @@ _COMMA_NUMBER = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _WORDS, _APART = re.compile(r"\S+"), re.compile(r"\S+(?: \S+)*")
 #: How spaces part names (words, with a unit in brackets, up to one), and values (words, with AM or PM, and with the date before it).
 _UNIT = r"[\[(][^\])]*[\])]"
-_NAMES = (_WORDS, _APART, re.compile(rf"\S+(?: {_UNIT})?"), re.compile(rf"[^\s\[(][^\[(]*{_UNIT}"))
+_NAMES = (_WORDS, _APART, re.compile(rf"\S+(?: {{1,2}}{_UNIT})?"), re.compile(rf"[^\s\[(][^\[(]*{_UNIT}"))
 _HALF = r"\d+:\d\d\S*(?: [AaPp]\.?[Mm]\.?)?|\S+"
 _VALUES = (_WORDS, re.compile(_HALF), re.compile(rf"(?:\d+[-/.]\d+[-/.]\d+ )?{_HALF}"))
 #: Most rows that hold all channels of a table whose channels stand on rows apart, and stretches in each of which every channel has one.

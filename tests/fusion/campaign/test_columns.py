@@ -918,3 +918,16 @@ def test_a_voltage_may_be_the_displacement_and_what_a_volt_is_has_no_default(tmp
     taken = table.corrected("4 = displacement").columns[3]
     assert (taken.unit, taken.remark) == ("V", "unit not known")
     assert table.corrected("4 = displacement 20 um").columns[3].unit == "20 um"
+
+
+def test_names_with_a_sign_in_brackets_and_sensors_that_are_not_there(tmp_path: Path) -> None:
+    """A DIL 805 dilatometer (LightForm-group/dilatometer_modelling_and_constitutive_behaviour), its second sensor unplugged."""
+    path = tmp_path / "007.asc"
+    head = (
+        " C:\\DIL805.PRO\\007.asc\n     No.          Time   Tem.1        DL  Phi  (D)   Tem.2\n"
+        "                     s      °C        µm                 °C\n"
+    )
+    path.write_text(head + rows("{k:8d}  {m:12.6f}   {t1}   {z:8.4f}    0.0001  -220.0"))
+    table = propose_table(path)
+    assert [one.heading for one in table.columns if one.role != "out"] == ["Time", "Tem.1", "DL"]
+    assert next(one.remark for one in table.columns if one.heading == "Tem.2") == "constant"

@@ -350,6 +350,13 @@ def test_a_record_is_known_in_every_encoding(tmp_path, encoding):
         assert (found.kind, found.headings) == (Kind.RECORD, ("Zeit [s]", "T1 [°C]", "Z [µm]"))
 
 
+def test_gaps_of_a_record_without_a_start_are_counted_from_it(tmp_path):
+    rows = [f"{k + 100 * (k > 30)},{20 + k / 9:.2f},{k}" for k in range(60)]
+    (tmp_path / "a.csv").write_text("\n".join(["t [s],T1 [degC],Z [um]", *rows]))
+    found = recognise(tmp_path / "a.csv")
+    assert "a row every 1 s, 1 gap: 30 s, 101 s" in found.kind.value.describe(found)
+
+
 def test_a_record_may_log_the_air_pressure(tmp_path):
     rows = [
         f"09.03.2026 06:{k:02}:00;{21 + k / 9:.2f};1010,2;{k}".replace(".", ",").replace("09,03,", "09.03.")
