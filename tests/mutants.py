@@ -59,6 +59,8 @@ _ALSO = {
         "tests/fusion/report/test_findings.py",
         "tests/fusion/analysis/consistency/test_every_check.py",
     ),
+    # Declarations of keys are what forms and drafts are made of.
+    "fusion/campaign/config.py": ("tests/fusion/campaign/test_keys.py",),
     # Every check once passed and once not.
     **dict.fromkeys(
         ("fusion/analysis/consistency/camera.py", "fusion/analysis/consistency/deviations.py"),
