@@ -264,6 +264,27 @@ SENSORS = 'sensors = { file = "laser.csv", places = "laser.csv" }'
 LOGGED = 'record = { file = "laser.csv", time = "t", temperatures = ["T"], displacements = ["X"] }'
 RANDOM = 'drivers = { file = "laser.csv", randomised = ["spindle [1/min]"]'
 MOVING = 'thermography.table = "moving"'
+STACK = 'thermography.stack = { start = "2026-03-09T06:30:00" }'
+#: Keys of one table that do not go together: lines, the line that is named, and how the message goes on.
+AT_ODDS = [
+    ((LASER, f'{RANDOM}, mean_dwell = "2 min", least_dwell = "-1 s" }}'), 3, "[drivers]: least_dwell -1 s must be"),
+    ((CAMERA, STACK.replace(" }", ', time_in_name = "%Y" }')), 3, "[thermography.stack]: time_in_name and start each say"),
+    ((CAMERA, STACK, "thermography.emissivity = 0.9"), 2, "[thermography]: another emissivity can only be"),
+    ((CAMERA, STACK, "thermography.relative_humidity = 0.4"), 2, "[thermography]: relative_humidity is already"),
+    ((LASER, 'interferometry.material_temperature = "camera"'), 2, "[interferometry]: material_temperature = "),
+    ((LASER, 'interferometry.expansion_coefficient = "11 +- 1 ppm/K"', 'interferometry.uncertainty.expansion_coefficient = "2 ppm/K"'),
+     2, "[interferometry]: the standard uncertainty of the expansion coefficient is 1 ppm/K"),
+    ((LOGGED.replace(", displacements", ", drivers"),), 2, "[record]: a record needs temperatures"),
+    ((LOGGED.replace('temperatures = ["T"], displacements', 'columns = { "T" = "degC" }, drivers'),),
+     2, "[record]: a record needs temperatures"),
+    ((LOGGED.replace(" }", ', columns = { "T" = { role = "driver" } } }'),), 2, '[record]: columns gives "T" a role'),
+    ((LOGGED.replace(" }", ', every = "1 s" }'),), 2, "[record]: write one of time"),
+    ((LOGGED.replace(" }", ', files = ["*.csv"] }'),), 2, "[record]: write either file"),
+    ((LOGGED.replace(" }", ', test = ["*.csv"] }'),), 2, "[record]: test names runs among files"),
+    ((LOGGED.replace('file = "laser.csv"', 'files = ["*.csv"], test = ["*.csv"]'),), 2, "[record]: test names all 1 runs"),
+    ((LOGGED.replace(" }", ", header_rows = { names = 2, values = 2 } }"),), 2, "[record.header_rows]: the values begin at line 2"),
+    ((LASER, 'sheet.logo = "laser.csv"'), 3, "[sheet]: logo = "),
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -291,10 +312,20 @@ def write(bare_folder: Path, *lines: str) -> Path:
         (LASER, CAMERA, PLAN, AXIS),
         (LASER, SENSORS, SIZE, AXIS),
         (LOGGED,),
+        (CAMERA, STACK),
+        (
+            CAMERA,
+            'thermography.region = [{ name = "A", polygon = [["1 px", "2 px"], ["3 px", "4 px"], ["1 px", "9 px"]] }]',
+        ),
+        (LASER, f'{RANDOM}, mean_dwell = "2 min", least_dwell = "0 s" }}'),
+        (LASER, 'interferometry.compensation = "redo"', 'interferometry.material_temperature = "camera"'),
+        (LASER, 'interferometry.dead_path = "-1 mm"'),
     ],
 )
 def test_any_subset_of_the_instruments_is_a_campaign(bare_folder: Path, lines: tuple[str, ...]) -> None:
-    assert load_campaign(write(bare_folder, *lines)).campaign.title == "X"
+    campaign, text = load_campaign(write(bare_folder, *lines)), "".join(lines)
+    assert bool(campaign.declared) == (CAMERA in lines or SENSORS in lines)
+    assert getattr(campaign.interferometry, "recompensates", False) == ("redo" in text or "dead_path" in text)
 
 
 @pytest.mark.parametrize(
@@ -333,6 +364,7 @@ def test_any_subset_of_the_instruments_is_a_campaign(bare_folder: Path, lines: t
             3,
             "[drivers]: least_dwell 180 s must be",
         ),
+        *AT_ODDS,
     ],
 )
 def test_what_a_campaign_lacks_is_named_at_its_line(
