@@ -402,8 +402,7 @@ class StateTable(_Measured):
     temperature_u_K: KelvinU = 0.1
 
 
-#: Shape of a region -> fewest and most points that give it.
-_POINTS = {"spot": (1, 1), "line": (2, 2), "rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
+_SHAPES = ("spot", "line", "rectangle", "ellipse", "polygon")
 
 
 class RegionTable(_Measured):
@@ -426,13 +425,13 @@ class RegionTable(_Measured):
 
     @model_validator(mode="after")
     def _is_whole(self) -> RegionTable:
-        given = [shape for shape in _POINTS if getattr(self, shape) is not None]
+        given = [shape for shape in _SHAPES if getattr(self, shape) is not None]
         if len(given) != 1:
             raise ValueError(
                 f"region {self.name} needs one of spot (a point), line (its ends), rectangle or ellipse (two opposite corners of the "
                 "rectangle around it), polygon (its corners in order)"
             )
-        if len(self._points) < _POINTS[self.shape][0]:
+        if self.shape == "polygon" and len(self._points) < 3:
             raise ValueError(f"the polygon of region {self.name} has {len(self._points)} corners; it needs at least 3")
         if len({length.unit for point in self._points for length in point}) > 1:
             raise ValueError(f"region {self.name} mixes px of the picture and mm of the plan; write all in one unit")
@@ -458,7 +457,7 @@ class RegionTable(_Measured):
     @property
     def shape(self) -> str:
         """Which of the shapes it is."""
-        return next(shape for shape in _POINTS if getattr(self, shape) is not None)
+        return next(shape for shape in _SHAPES if getattr(self, shape) is not None)
 
     @property
     def unit(self) -> str:

@@ -104,6 +104,7 @@ def test_paths_start_from_the_campaign_file_and_frames_are_sorted(folder: Path) 
 # Each row: text to replace, its replacement, and how the message begins after "FOLDER/campaign.toml".
 BAD = [
     ("emissivity", "emisivity", ", line 7: unknown key thermography.emisivity; did you mean emissivity?"),
+    ('title = "X axis"\naxis = "X"', 'title = ""\naxxis = "X"', ", line 3: unknown key campaign.axxis; did you mean axis?"),
     ("emissivity = 0.97", 'emissivity = "0.97 +- much"',
      ', line 7: thermography.emissivity = "0.97 +- much": this is a number without quotes'),
     ("emissivity = 0.97", 'emissivity = "0.97 +- 2"',
@@ -317,7 +318,7 @@ def write(bare_folder: Path, *lines: str) -> Path:
             CAMERA,
             'thermography.region = [{ name = "A", polygon = [["1 px", "2 px"], ["3 px", "4 px"], ["1 px", "9 px"]] }]',
         ),
-        (LASER, f'{RANDOM}, mean_dwell = "2 min", least_dwell = "0 s" }}'),
+        (LASER, f'{RANDOM}, mean_dwell = "2 min", least_dwell = "1 s" }}'),
         (LASER, 'interferometry.compensation = "redo"', 'interferometry.material_temperature = "camera"'),
         (LASER, 'interferometry.dead_path = "-1 mm"'),
     ],
