@@ -78,7 +78,7 @@ _SPREAD = re.compile(r"^(u|s|σ)\s*\(|±|\+/?-$")
 #: An error beside the column that has it.
 _ERROR_OF = re.compile(r"(.+?)[\s_]+err(?:or)?", re.I)
 #: Units of a speed of rotation, whose sign n is that of a count too.
-_OF_SPEED = ("rpm", "RPM", "1/min", "U/min", "min-1", "min^-1", "1/s")
+_OF_SPEED = ("rpm", "RPM", "1/min", "U/min", "tr/min", "r/min", "rev/min", "min-1", "min^-1", "1/s")
 #: A unit of a rate of change.
 _RATE = re.compile(r".+/\s*(s|sec|min|h|hr)")
 #: A line above a table that states units.
@@ -772,8 +772,8 @@ def _word(name: str) -> tuple[str, str]:
         found = next((word for word in words if word in known), "")
         if found:
             return found, role
-    # Lagertemperatur, airtemp.
-    endings = ((end, role) for role, known in _WORDS for end in known if len(end) >= _SHORTEST_ENDING)
+    # Lagertemperatur, airtemp, 主軸温度.
+    endings = ((end, role) for role, known in _WORDS for end in known if len(end) >= _SHORTEST_ENDING or end > "\u2e80")
     return next(((end, role) for end, role in endings if any(word.endswith(end) for word in words)), ("", ""))
 
 

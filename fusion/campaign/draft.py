@@ -202,11 +202,20 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     readings, records = content.of(Kind.DEVIATIONS), content.of(Kind.RECORD)
     if not (content.frames or readings or records):
         others = [one for kind, files in content.files.items() if kind not in _NO_INPUT for one in files]
-        told = [*content.unknown, *others][:3]
-        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason or one.kind.value.words}" for one in told)
+        told = [*content.unknown, *others]
+        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason or one.kind.value.words}" for one in told[:3])
+        logs = [
+            one.logged for one in told if one.kind in (Kind.UNKNOWN, Kind.DRIVERS) and not isinstance(one.logged, str)
+        ]
+        apart = all(any(log.of(role) for log in logs) for role in ("temperature", "displacement"))
         raise DraftError(
             f"{content.folder}: neither thermal frames nor deviations nor a record of temperatures and displacements in it"
             + (f" ({unknown})" if unknown else "; name the folder that holds the files of the measurement")
+            + (
+                "; write the rows of all loggers into one table with the columns of all, empty where a logger has none"
+                if apart
+                else ""
+            )
         )
     yield f"{DRAFTED} Every quantity carries its unit in the value; paths start from the folder of this file."
     yield f'# A line with "{TO_FILL}" has to be completed; thermofuse check {CAMPAIGN_FILE} says what is still missing.'

@@ -551,7 +551,9 @@ def _tabulated(path: Path, lines: list[str], sample: list[str], header: HeaderRo
 
     def named(line: str) -> list[str] | None:
         """Return the fields of a line of names or units; None where nothing tells to which columns they belong."""
-        in_order = next((found for one in _NAMES if len(found := one.findall(line)) == width), None)
+        in_order = next(
+            (found for one in _NAMES if len(found := one.findall(line)) == width and "/" not in found), None
+        )
         by_place = placed(line, _APART) if len(_APART.findall(line)) > 1 else None
         return None if in_order and by_place not in (None, in_order) else in_order or by_place
 

@@ -348,7 +348,7 @@ CHINESE_WORDS = tuple(
 )
 
 
-# Bytes of a text file to text: UTF-8, UTF-16, the code page of Western Windows, and that of Chinese Windows.
+# Bytes of a text file to text: UTF-8, UTF-16, the code page of Western Windows, and those of Chinese and Japanese Windows.
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 
@@ -404,6 +404,10 @@ def _in_a_code_page(content: bytes) -> str:
     # Every Western text can be read as Chinese too: headings of tables tell them apart.
     if any(word in chinese for word in CHINESE_WORDS):
         return chinese
+    with suppress(UnicodeDecodeError):
+        japanese = content.decode("cp932")
+        if any(word in japanese for word in _VOCABULARY["japanese"]):
+            return japanese
     try:
         return content.decode("cp1252")
     except UnicodeDecodeError:

@@ -931,3 +931,12 @@ def test_names_with_a_sign_in_brackets_and_sensors_that_are_not_there(tmp_path: 
     table = propose_table(path)
     assert [one.heading for one in table.columns if one.role != "out"] == ["Time", "Tem.1", "DL"]
     assert next(one.remark for one in table.columns if one.heading == "Tem.2") == "constant"
+
+
+def test_a_logger_of_japan_is_read_in_its_code_page(tmp_path: Path) -> None:
+    text = "日付,時刻,主軸温度,軸受温度,変位(mm)\n" + rows("{time:%Y/%m/%d},{time:%H:%M:%S},{t1},{t2},{z}")
+    (tmp_path / "log.csv").write_bytes(text.encode("cp932"))
+    table = propose_table(tmp_path / "log.csv")
+    assert [(one.heading, one.role) for one in table.columns] == [
+        ("日付", "time"), ("時刻", "time"), ("主軸温度", "temperature"), ("軸受温度", "temperature"), ("変位(mm)", "displacement"),
+    ]  # fmt: skip

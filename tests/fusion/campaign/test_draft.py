@@ -272,6 +272,14 @@ def test_measured_files_that_the_campaign_does_not_take_are_told(tmp_path):
     assert load_campaign(path).interferometry is not None
 
 
+def test_loggers_in_files_of_their_own_are_told_to_be_one_table(tmp_path):
+    for name, heading in (("temperatures", "T1 [degC]"), ("probe", "Z [um]")):
+        rows = [f"2026-03-09T06:{k:02}:00Z,{20 + k / 9:.2f}" for k in range(60)]
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"time,{heading}", *rows]))
+    with pytest.raises(DraftError, match="write the rows of all loggers into one table with the columns of all"):
+        write_campaign(tmp_path, Asker(None))
+
+
 def test_a_log_of_temperatures_beside_a_laser_is_offered_as_drivers(tmp_path):
     """HOBO's export: channels that only their places tell apart, no displacement, and no material for an environment."""
     folder = write_laser(tmp_path / "test", 5, 4).parent
