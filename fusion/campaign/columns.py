@@ -571,7 +571,7 @@ def _times(rows: logs.Rows, keys: dict[str, Any], asked: dict[str, str]) -> tupl
 
 def _refuse_own_times(path: Path, rows: logs.Rows, layout: LoggedTable, time: str) -> None:
     """Refuse a table of which another column of times does not run as the first: its channels have a clock each."""
-    for name in filter(_OWN_TIME.match, map(str, rows.frame.columns)):
+    for name in filter(_OWN_TIME.match, map(str, rows.frame.columns.drop(time))):
         stated = (*_stated_units(rows, name), layout.time_unit, *_stated_units(rows, time))
         own = layout.model_copy(update={"time_unit": next((unit for unit in stated if unit in TIME_UNITS), None)})
         try:

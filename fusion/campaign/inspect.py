@@ -315,9 +315,15 @@ def _logs_drivers(found: Recognised) -> bool:
 
 
 def _logs_environment(found: Recognised) -> bool:
-    # A record may log the air pressure too.
-    is_log = bool(resolve_name("interferometry.io.readings:is_environment_log")(found.path))
-    return is_log and (isinstance(found.logged, str) or bool(found.logged.lacks))
+    from interferometry.io.readings import ENVIRONMENT_COLUMNS, is_environment_log
+    from interferometry.io.tables import read_heading
+
+    if not is_environment_log(found.path):
+        return False
+    # A record may log the air pressure too; it has columns beside air and material.
+    roles = {read_heading(name).role for name in found.first_line}
+    alone = roles <= {"time", *(name for _, name, *_ in ENVIRONMENT_COLUMNS)}
+    return alone or isinstance(found.logged, str) or bool(found.logged.lacks)
 
 
 def _holds_deviations(found: Recognised) -> bool:

@@ -113,6 +113,8 @@ def possible_dates(text: str) -> dict[str, date]:
 
     With dots the day is first, or the year where that is the later date: 26.03.09.
     """
+    if text[:4].isdecimal():
+        return {}
     match = _NUMERIC.fullmatch(_date_first(text))
     if match is None or len(match["a"]) == 4:
         return {}
@@ -283,9 +285,15 @@ def fold(text: str) -> str:
     return re.sub(r"[\s_.:;,/\\#’'–-]+", " ", plain.replace("º", "o").replace("№", "no")).strip()
 
 
+#: A number, or a time by ISO 8601, which is no heading: a file has a million of them.
+_VALUE = re.compile(r"[+-]?\d[\d\s.,:+TZeE-]*")
+
+
 @lru_cache(1 << 16)
 def read_heading(text: str) -> Heading:
     """Return what a heading such as "Abweichung [µm]" or "Écart / µm" names, and the unit that it carries."""
+    if _VALUE.fullmatch(text):
+        return Heading(text, None, None)
     name, unit = split_unit(text)
     role = _ROLES.get(fold(name).replace(" ", ""))
     if role == "target" and unit is not None:
