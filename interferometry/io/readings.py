@@ -37,6 +37,7 @@ from interferometry.io.renishaw import (
     read_rtl,
 )
 from interferometry.io.tables import (
+    PLAIN_VALUE,
     UNIT_WORDS,
     DateOrder,
     DelimitedTable,
@@ -849,8 +850,9 @@ def _find_block(grid: Grid) -> WideTable | None:
     if width * len(grid.rows) > _MOST_CELLS:
         return None
     cells = [[*fields, *[""] * (width - len(fields))] for _, fields in grid.rows]
-    for at, row in enumerate(cells):
-        headings = [read_heading(text) for text in row]
+    heads = (at for at, row in enumerate(cells) if any(text and not PLAIN_VALUE.fullmatch(text) for text in row))
+    for at in heads:
+        headings = [read_heading(text) for text in cells[at]]
         # Without a column of positions, that of the targets gives them: "Target" is the usual word for both.
         name = "position" if any(heading.role == "position" for heading in headings) else "target"
         below = (_positions_below(grid, cells, at, column) for column, one in enumerate(headings) if one.role == name)

@@ -286,13 +286,13 @@ def fold(text: str) -> str:
 
 
 #: A number, or a time by ISO 8601, which is no heading: a file has a million of them.
-_VALUE = re.compile(r"[+-]?\d[\d\s.,:+TZeE-]*")
+PLAIN_VALUE = re.compile(r"[+-]?\d[\d\s.,:+TZeE-]*")
 
 
 @lru_cache(1 << 16)
 def read_heading(text: str) -> Heading:
     """Return what a heading such as "Abweichung [µm]" or "Écart / µm" names, and the unit that it carries."""
-    if _VALUE.fullmatch(text):
+    if PLAIN_VALUE.fullmatch(text):
         return Heading(text, None, None)
     name, unit = split_unit(text)
     role = _ROLES.get(fold(name).replace(" ", ""))
