@@ -54,6 +54,11 @@ _ALSO = {
         "tests/fusion/campaign/test_columns.py::test_days_counted_from_a_date_are_told_by_their_numbers_and_marked[datenum-719529]",
         "tests/fusion/campaign/test_keys.py",
     ),
+    # Actions in full and in brief, and which come first.
+    "fusion/report/findings.py": (
+        "tests/fusion/report/test_wording.py",
+        "tests/fusion/report/test_first_screen.py::test_an_action_is_cut_at_a_clause",
+    ),
     # What every surface says, and the words of every check.
     "fusion/report/wording.py": (
         "tests/fusion/report/test_findings.py",

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from html import unescape
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,9 +15,10 @@ from rich.console import Console
 from fusion.pipeline.consistency import inputs_part
 from fusion.report.campaign import describe_campaign
 from fusion.report.exports.tables import findings_table
-from fusion.report.findings import Finding, findings, summary_rows, summary_table
+from fusion.report.findings import Finding, brief_rows, findings, sharpen, summary_rows, summary_table
 from fusion.report.fleet import Row, with_findings
 from fusion.report.page import render_page
+from fusion.results.parts import Quantity
 from fusion.results.results import Notice, Results, assemble
 from fusion.results.store import write_json
 from tests.fusion.report.test_campaign import ORIGIN
@@ -165,3 +168,81 @@ def test_plain_predictions_are_last_value_mean_and_the_best_regression():
     best = results.loop.model_copy(update={"best_baseline": "mean", "steps": ()})
     rows = dict(summary_rows(results.model_copy(update={"loop": best})))
     assert rows["plain predictions"].count(", ") == 1 and "->" not in rows["held-out error"]
+
+
+def budget(*terms: tuple[str, float, float | None, str], side: str = "") -> SimpleNamespace:
+    """A of 10 um with U = 4 um, limit 8 um, and its contributions: name, term of A, input u, origin."""
+    a_um = Quantity(value=10.0, u=2.0)
+    told = [
+        SimpleNamespace(
+            contributor=name, u=u, origin=origin, A_um=None if side else term, unidirectional_um={f"A_{side}": term}
+        )
+        for name, term, u, origin in terms
+    ]
+    one_way = SimpleNamespace(A_um=a_um)
+    return SimpleNamespace(
+        approach=side, unit="um", cycles=(1, 2, 3, 4, 5), A_um=Quantity(value=None, u=None) if side else a_um,
+        positive=one_way, negative=one_way, contributions=told, tolerances=[SimpleNamespace(quantity="A", limit_um=8.0)],
+        conditions=[SimpleNamespace(key="axis", text="X"), SimpleNamespace(key="expansion_coefficient", text="11.7 ppm/K")],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("part", "found"),
+    [
+        (None, None),
+        (budget(), None),
+        (
+            budget(("sampling", 0.6, 0.6, "readings"), ("expansion_coefficient", 1.9, 2.0, "assumed, 2 ppm/K")),
+            ("A", "expansion_coefficient", 0.9025, 'expansion_coefficient = "11.7 +- 0.3 ppm/K"', 1.3730, "fail", 0),
+        ),
+        # A stated coefficient, and one whose uncertainty is as good as stated, cannot be sharpened.
+        (budget(("expansion_coefficient", 2.0, 2.0, "stated")), ("A", "expansion_coefficient", 1.0, "", math.inf, "", 0)),
+        (budget(("material_temperature", 2.0, 0.12, "assumed")), ("A", "material_temperature", 1.0, "", math.inf, "", 0)),
+        (
+            budget(("sampling", 1.6, 1.6, "readings"), ("extremes", 1.2, 1.2, "readings"), side="negative"),
+            ("A↓", "sampling", 0.64, "", 2.0, "", 20),
+        ),
+    ],
+)  # fmt: skip
+def test_the_uncertainty_of_a_is_sharpened_where_most_of_it_is_assumed_or_scatter(
+    part: Any, found: tuple[Any, ...] | None
+) -> None:
+    told = sharpen(part)
+    stated = told and (
+        told.symbol, told.contributor, told.share, told.line, told.sharper_um, told.decision, told.cycles
+    )  # fmt: skip
+    assert stated == (found and tuple(pytest.approx(one, rel=1e-4) if isinstance(one, float) else one for one in found))
+    assert told is None or told.expanded_um == 4.0
+
+
+@pytest.mark.parametrize(
+    ("name", "figures", "said"),
+    [
+        (
+            "axis",
+            "A 1.00 ± 0.20 µm; Largest drift 11.13 ± 0.34 µm; Held-out error 0.40 µm",
+            "1. Look up cycle 9 in the logs of machine and sensors.\n2. Position 3: c.",
+        ),
+        (
+            "laser",
+            "A 1.00 ± 0.20 µm; R 1.00 ± 0.20 µm; B 1.00 ± 0.20 µm; M 1.00 ± 0.20 µm",
+            "1. Nothing has to be done.",
+        ),
+        (
+            "record",
+            "Largest drift 89.2 ± 1.8 µm; Held-out error 0.40 µm; Unexplained variance 10 %",
+            "1. Ask whether the laser was zeroed or its beam broken at that time.",
+        ),
+        (
+            "camera",
+            "Highest > 312 °C; Lowest 16.4 ± 2.4 °C; Mean 31.7 ± 2.6 °C",
+            "1. Nothing has to be done; use the temperatures as they are, with their uncertainty.",
+        ),
+    ],
+)
+def test_the_terminal_shows_what_the_first_screen_says(name: str, figures: str, said: str) -> None:
+    rows = dict(brief_rows(SAMPLES[name][0]))
+    assert rows["figures"] == figures and rows["next"] == said
+    alone = "Highest temperature" if name == "camera" else None
+    assert rows.get("temperature", "").startswith(alone or "") and ("decision" in rows) is (alone is None)
