@@ -182,8 +182,9 @@ def budget(*terms: tuple[str, float, float | None, str], side: str = "") -> Simp
     one_way = SimpleNamespace(A_um=a_um)
     return SimpleNamespace(
         approach=side, unit="um", cycles=(1, 2, 3, 4, 5), A_um=Quantity(value=None, u=None) if side else a_um,
-        positive=one_way, negative=one_way, contributions=told, tolerances=[SimpleNamespace(quantity="A", limit_um=8.0)],
-        conditions=[SimpleNamespace(key="axis", text="X"), SimpleNamespace(key="expansion_coefficient", text="11.7 ppm/K")],
+        positive=one_way, negative=one_way, contributions=told,
+        tolerances=[SimpleNamespace(quantity="B", limit_um=20.0), SimpleNamespace(quantity="A", limit_um=8.0)],
+        conditions=[SimpleNamespace(key="remarks", text="5 runs"), SimpleNamespace(key="expansion_coefficient", text="11.7 ppm/K")],
     )  # fmt: skip
 
 
@@ -200,8 +201,8 @@ def budget(*terms: tuple[str, float, float | None, str], side: str = "") -> Simp
         (budget(("expansion_coefficient", 2.0, 2.0, "stated")), ("A", "expansion_coefficient", 1.0, "", math.inf, "", 0)),
         (budget(("material_temperature", 2.0, 0.12, "assumed")), ("A", "material_temperature", 1.0, "", math.inf, "", 0)),
         (
-            budget(("sampling", 1.6, 1.6, "readings"), ("extremes", 1.2, 1.2, "readings"), side="negative"),
-            ("A↓", "sampling", 0.64, "", 2.0, "", 20),
+            budget(("sampling", 1.6, 1.6, "readings"), ("extremes", 0.8, 0.8, "readings"), side="negative"),
+            ("A↓", "sampling", 0.64, "", 2.5298, "", 20),
         ),
     ],
 )  # fmt: skip
@@ -246,3 +247,13 @@ def test_the_terminal_shows_what_the_first_screen_says(name: str, figures: str, 
     assert rows["figures"] == figures and rows["next"] == said
     alone = "Highest temperature" if name == "camera" else None
     assert rows.get("temperature", "").startswith(alone or "") and ("decision" in rows) is (alone is None)
+
+
+@pytest.mark.parametrize(("cameras", "lines"), [("C", ["whole picture", "spot", "whole picture"]), ("CB", ["B", "C"])])
+def test_every_region_has_its_line_and_of_several_cameras_every_picture(cameras: str, lines: list[str]) -> None:
+    (whole,), pictures = PICTURES["regions"], PICTURES["thermograms"]
+    regions = [whole | {"camera": "B", "maximum_degC": {"value": 99.0, "u": None}}, whole | {"name": "spot"}, whole]
+    of_each = [pictures["cameras"][0] | {"name": name} for name in cameras]
+    found = findings(assemble("C", {"thermograms": pictures | {"cameras": of_each}, "regions": regions}, []))
+    assert [one.name for one in found if one.code == "region_line"] == lines
+    assert found[0].code == "highest" and found[0].tile is not None and found[0].tile.value == "> 312 °C"

@@ -100,6 +100,7 @@ def five_questions_are_answered(told, part):
             "Inspect guideway, scale, screw and nut at this position for preload, wear, contamination and looseness; repeat it.",
             "Inspect guideway, scale, screw and nut at this position.",
         ),
+        (f"Look {'here and there ' * 5}again.", f"Look {'here and there ' * 4}here …"),
         (
             "Not confirmed, check this only where nothing else is found: look for play in the nut (cold), and measure again.",
             "Unconfirmed: look for play in the nut, and measure again.",

@@ -601,6 +601,14 @@ def test_what_to_do_about_a_cause_is_conditional_where_a_doubted_input_endangers
     assert about.startswith("Only if ")
 
 
+@pytest.mark.parametrize(
+    ("code", "asked"), [("datum", True), ("camera_place", True), ("clocks", False), ("camera_clock", False)]
+)
+def test_more_is_to_be_logged_unless_a_clock_is_doubted(code, asked):
+    steps = next_steps(results(loop("unexplained", shape="a wave"), inputs=doubted(code)))
+    assert (say("log_more", "a wave") in steps) is asked
+
+
 def test_no_cause_is_to_be_looked_for_where_none_is_separable():
     (nothing,) = next_steps(results(loop("unexplained", step("dead_path")).model_copy(update={"separable": False})))
     assert effect_words("dead_path").remedy not in nothing
