@@ -51,12 +51,6 @@ def driven() -> tuple[Record, xr.Dataset, RecordLoop]:
     return run_of(twin_table(source, seed=3))
 
 
-@pytest.fixture(scope="module")
-def stepped() -> tuple[Record, xr.Dataset, RecordLoop]:
-    """A machine with a step that is found."""
-    return run_of(twin_table(EffectRecipe("step_event", 6.0, parameters={"at_cycle": 9}), seed=5))
-
-
 def readings_of(model: Recursion, record: Record) -> np.ndarray:
     """Readings (blocks, inputs) as the control gets them."""
     return np.column_stack(
@@ -231,8 +225,12 @@ def test_results_of_an_earlier_version_are_refused(driven):
         make_recursion(product.drop_vars("driver_square"), loop, sampling_s=1.0, **FROM)
 
 
-def test_an_event_is_in_the_fit_and_not_in_the_recursion(stepped):
-    record, product, loop = stepped
+def test_an_event_is_in_the_fit_and_not_in_the_recursion(rng):
+    """Two displacements that follow two sensors, with a step of both in the middle."""
+    temperature = 20.0 + np.cumsum(rng.normal(0.0, 0.1, (80, 2)), axis=0)
+    displacement = (temperature - 20.0) @ [[2.0, -1.0], [0.5, 3.0]] + rng.normal(0.0, 0.1, (80, 2))
+    displacement[40:] += 4.0
+    record, product, loop = run_of(table_of(displacement, temperature, step_s=300.0))
     assert "step_event" in [one.effect for one in loop.steps]
     model = make_recursion(product, loop, sampling_s=record.block_s, **FROM)
     assert "not contained, because no reading shows it: step_event" in model.remarks
