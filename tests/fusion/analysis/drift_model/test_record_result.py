@@ -26,6 +26,7 @@ from fusion.analysis.drift_model.record import (
 from fusion.analysis.drift_model.record_data import Record, RecordedRun, reduce_record
 from fusion.analysis.drift_model.search import Confirmation, Confirmed, Decision, LoopState, Reason, Round, Score, Step
 from fusion.analysis.effects.effect import Candidate
+from fusion.analysis.effects.library import library
 from fusion.results.loop import Baselines, ModelError
 from fusion.twin.recipe import EffectRecipe
 from interferometry.drift.gls import drift_system, fit_fixed_effects
@@ -242,7 +243,8 @@ def test_an_effect_that_fails_on_the_hold_out_set_is_contradicted_and_leaves_the
     train, _ = hold_out(record)
     displacement = record.displacement.copy()
     displacement[~train] -= 4.0 * np.cos(2 * np.pi * record.seconds[~train] / 2220.0)[:, None]
-    result = close_record(replace(record, displacement=displacement), ["quasi_static"])
+    searched = {name: library()[name] for name in ("periodic_disturbance", "step_event")}
+    result = close_record(replace(record, displacement=displacement), ["quasi_static"], effects=searched)
     told = result.described([])
     (step,) = told.steps
     assert step.effect == "periodic_disturbance" and not step.confirmed

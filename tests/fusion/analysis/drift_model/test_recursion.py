@@ -26,6 +26,7 @@ from fusion.analysis.drift_model.recursion import (
     sensor_curve,
 )
 from fusion.analysis.drift_model.verification import choose_test, covariance_after, propose_tests
+from fusion.analysis.effects.library import library
 from fusion.pipeline.record import record_variables
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import FAILED, OK, SATURATED, Recursion, RecursionError, run_recursion
@@ -37,10 +38,10 @@ pytestmark = pytest.mark.long
 FROM = {"campaign": "twin", "results_sha256": "0" * 64}
 
 
-def run_of(table: xr.Dataset) -> tuple[Record, xr.Dataset, RecordLoop]:
-    """Record, product and loop of a run without files."""
+def run_of(table: xr.Dataset, *searched: str) -> tuple[Record, xr.Dataset, RecordLoop]:
+    """Record, product and loop of a run without files that searches for some effects only."""
     record = reduce_record(table)
-    result = close_record(record, ["quasi_static"])
+    result = close_record(record, ["quasi_static"], effects={name: library()[name] for name in searched})
     return record, record_variables(record, result), result.described(())
 
 
@@ -48,7 +49,7 @@ def run_of(table: xr.Dataset) -> tuple[Record, xr.Dataset, RecordLoop]:
 def driven() -> tuple[Record, xr.Dataset, RecordLoop]:
     """A spindle that no sensor sees and whose speed is logged."""
     source = EffectRecipe("unseen_heat_source", 8.0, parameters={"time_constant_min": 20.0})
-    return run_of(twin_table(source, seed=3))
+    return run_of(twin_table(source, seed=3), "unseen_heat_source")
 
 
 def readings_of(model: Recursion, record: Record) -> np.ndarray:
@@ -230,7 +231,7 @@ def test_an_event_is_in_the_fit_and_not_in_the_recursion(rng):
     temperature = 20.0 + np.cumsum(rng.normal(0.0, 0.1, (80, 2)), axis=0)
     displacement = (temperature - 20.0) @ [[2.0, -1.0], [0.5, 3.0]] + rng.normal(0.0, 0.1, (80, 2))
     displacement[40:] += 4.0
-    record, product, loop = run_of(table_of(displacement, temperature, step_s=300.0))
+    record, product, loop = run_of(table_of(displacement, temperature, step_s=300.0), "step_event")
     assert "step_event" in [one.effect for one in loop.steps]
     model = make_recursion(product, loop, sampling_s=record.block_s, **FROM)
     assert "not contained, because no reading shows it: step_event" in model.remarks

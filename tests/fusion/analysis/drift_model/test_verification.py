@@ -30,7 +30,7 @@ def logged(seed: int, *, swing_K: float = 2.0) -> Record:
 @pytest.fixture(scope="module")
 def first():
     record = logged(1)
-    result = close_record(record, ["quasi_static"])
+    result = close_record(record, ["quasi_static"], effects={})
     product, loop = record_variables(record, result), result.described(())
     return product, loop, make_recursion(product, loop, campaign="", results_sha256="0", sampling_s=record.block_s)
 
