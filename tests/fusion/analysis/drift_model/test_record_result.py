@@ -238,7 +238,7 @@ def test_a_result_prints_a_summary_and_draws_its_errors():
 def test_an_effect_that_fails_on_the_hold_out_set_is_contradicted_and_leaves_the_forecast():
     """The wave turns against itself in the hold-out set: the error after the step is larger, and the forecast is made without it."""
     record = reduce_record(
-        twin_table(EffectRecipe("periodic_disturbance", 0.6, parameters={"period_min": 37.0}), seed=44)
+        twin_table(EffectRecipe("periodic_disturbance", 0.6, parameters={"period_min": 37.0}), seed=44, hours=12.0)
     )
     train, _ = hold_out(record)
     displacement = record.displacement.copy()

@@ -49,7 +49,7 @@ def run_of(table: xr.Dataset, *searched: str) -> tuple[Record, xr.Dataset, Recor
 def driven() -> tuple[Record, xr.Dataset, RecordLoop]:
     """A spindle that no sensor sees and whose speed is logged."""
     source = EffectRecipe("unseen_heat_source", 8.0, parameters={"time_constant_min": 20.0})
-    return run_of(twin_table(source, seed=3), "unseen_heat_source")
+    return run_of(twin_table(source, seed=3, hours=12.0), "unseen_heat_source")
 
 
 def readings_of(model: Recursion, record: Record) -> np.ndarray:
