@@ -192,6 +192,15 @@ def draw_no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"fusion.pipeline.run.{name}", lambda *_: Drawn({}))
 
 
+def search_few(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Runs in which nobody looks for causes search for some effects only."""
+    from fusion.analysis.effects.library import library
+
+    few = {name: library()[name] for name in names}
+    for module in ("analysis.drift_model.record", "pipeline.drift_model"):
+        monkeypatch.setattr(f"fusion.{module}.library", lambda: few)
+
+
 @pytest.fixture
 def no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
     draw_no_charts(monkeypatch)

@@ -35,6 +35,7 @@ from fusion.results.recursion import read_recursion
 from fusion.results.store import read_product
 from tests.fusion.app.texts import texts
 from tests.fusion.campaign_parts import change, simulated
+from tests.fusion.conftest import search_few
 
 pytestmark = pytest.mark.chain
 
@@ -171,6 +172,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(socket.socket, "connect", no_network)
         patch.setattr(socket, "getaddrinfo", no_network)
+        search_few(patch, "step_event")
         run("run", folder / "campaign.toml")
     assert [path.name for path in base.iterdir()] == [folder.name]
     return folder / "results"
@@ -309,7 +311,9 @@ def axis(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for old, new in FILES.items():
         (folder / old).rename(folder / new)
         change(campaign, f'"{old}', f'"{normalize("NFC", new)}')
-    run("run", campaign)
+    with pytest.MonkeyPatch.context() as patch:
+        search_few(patch, "axis_expansion", "table_offset", "reversal_drift")
+        run("run", campaign)
     return folder / "results"
 
 
