@@ -204,3 +204,8 @@ def search_few(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
 @pytest.fixture
 def no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
     draw_no_charts(monkeypatch)
+
+
+@pytest.fixture
+def few_effects(monkeypatch: pytest.MonkeyPatch) -> None:
+    search_few(monkeypatch, "axis_expansion", "table_offset", "reversal_drift")

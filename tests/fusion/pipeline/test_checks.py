@@ -150,7 +150,7 @@ def test_a_contradiction_is_refused_before_a_folder_is_made(copied, tmp_path):
 
 
 @pytest.mark.chain
-@pytest.mark.usefixtures("no_charts")
+@pytest.mark.usefixtures("no_charts", "few_effects")
 def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(copied, results_folder, tmp_path):
     with_readings(copied, lambda table: -table["deviation_um"])
     results = run_campaign(copied / "campaign.toml", shutil.copytree(results_folder, tmp_path / "out"), resume=True)

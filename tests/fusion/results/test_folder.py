@@ -194,7 +194,7 @@ def test_results_within_results_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.usefixtures("no_charts")
+@pytest.mark.usefixtures("no_charts", "few_effects")
 def test_a_changed_campaign_computes_only_what_changed(
     campaign_folder: Path, results_folder: Path, tmp_path: Path
 ) -> None:
