@@ -145,16 +145,3 @@ def read_everything(path: Path) -> tuple[int, int]:
         assert counts.dtype == np.uint16 and counts.shape == frame.shape
         read += 1
     return read, refused
-
-
-def fuzz(folder: Path, inputs: int, seed: int) -> tuple[int, int]:
-    """Read damaged copies of intact files, and every tenth time random bytes; return frames read and refused."""
-    rng = np.random.default_rng(seed)
-    intact = seeds(folder)
-    path = folder / "damaged"
-    totals = np.zeros(2, int)
-    for index in range(inputs):
-        data = mutate(intact[index % len(intact)], rng) if index % 10 else rng.bytes(int(rng.integers(2000)))
-        path.write_bytes(data)
-        totals += read_everything(path)
-    return int(totals[0]), int(totals[1])
