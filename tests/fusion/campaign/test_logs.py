@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import json
 import os
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.campaign.config import CampaignError, DriversTable, load_campaign
+from fusion.campaign.config import CampaignError, DriversTable, HeaderRows, load_campaign
 from fusion.campaign.draft import Asker, write_campaign
 from fusion.campaign.inputs import pipe_notices, read_record
-from fusion.campaign.logs import ContactSensors, TableError, read_drivers, read_sensors, split_heading
+from fusion.campaign.logs import (
+    ContactSensors,
+    TableError,
+    _usual_step_s,
+    read_drivers,
+    read_rows,
+    read_sensors,
+    split_heading,
+    unwrapped,
+)
 from tests.fusion.campaign_parts import without
 
 RECORD = """\
@@ -39,6 +50,50 @@ def record(folder: Path, content: str, *, time: str = "time [min]", more: str = 
 def test_a_column_without_a_unit_is_refused() -> None:
     with pytest.raises(TableError, match=r'the column "duty" has no unit; .* for example "duty \[1\]"'):
         split_heading(Path("drivers.csv"), "duty")
+
+
+@pytest.mark.parametrize(
+    ("text", "how", "columns", "lines", "units", "odd"),
+    [
+        ('a,b\n1,"x\ny"\n2,z\n3,4,5\n', {}, {"a": [1, 2], "b": ["x\ny", "z"]}, [2, 4], {}, [(5, "3 fields")]),
+        ("a,b\n1,2\n# 3,4\n\n5,6\n", {}, {"a": [1, 5], "b": [2, 6]}, [2, 5], {}, []),
+        ("t,T,n\n1,20 °C,4\n2,68 °F,5\n3,,6\n", {}, {"t": [1, 2, 3], "T": [20.0, 20.0, None], "n": [4, 5, 6]}, [2, 3, 4],
+         {"T": "degC"}, []),
+        ("t,T,unit\n1,20,°C\n2,21,°C\n", {}, {"t": [1, 2], "T": [20, 21], "unit": ["°C", "°C"]}, [2, 3], {"T": "°C"}, []),
+        ("t,T\n0,20\n1,-999\n2,---\n3,1e38\n4,24\n", {"missing": [-999]},
+         {"t": [0, 1, 2, 3, 4], "T": ["20", None, "---", "1e38", "24"]}, [2, 3, 4, 5, 6], {}, [(3, "-999"), (4, "---"), (5, "1e38")]),
+        ("t,T\n0,20\n1,21\n2,22\nMean,21\nMax,22\n", {}, {"t": ["0", "1", "2"], "T": [20, 21, 22]}, [2, 3, 4], {},
+         [(5, "Mean"), (6, "Max")]),
+        ("t;Z\n0;1,234\n1;12,345\n2;1,234,567\n", {}, {"t": [0, 1, 2], "Z": ["1234", "12345", "1234567"]}, [2, 3, 4], {}, []),
+        ("Mill\nt;T;Z\ns;°C;mm\n0;20,5;1\n30;21,5;2\n", {"header": HeaderRows(names=2, units=3, values=4)},
+         {"t": [0, 30], "T": [20.5, 21.5], "Z": [1, 2]}, [4, 5], {"t": "s", "T": "°C", "Z": "mm"}, []),
+        ("0;20,5;1\n30;21,5;2\n", {"header": HeaderRows(values=1)}, {"1": [0, 30], "2": [20.5, 21.5], "3": [1, 2]}, [1, 2], {}, []),
+        ("t   oil temp  Z\n0   20.5      1.5\n30            2.5\n60  22.5      3.5\n90  23.5      4.5\n", {},
+         {"t": [0, 30, 60, 90], "oil temp": [20.5, None, 22.5, 23.5], "Z": [1.5, 2.5, 3.5, 4.5]}, [2, 3, 4, 5], {}, []),
+        ("t,T\n20260309063000,20\n20260309063100,21\n", {}, {"t": ["20260309T063000", "20260309T063100"], "T": [20, 21]}, [2, 3], {}, []),
+    ],
+)  # fmt: skip
+def test_rows_of_a_text(
+    tmp_path: Path, text: str, how: dict[str, Any], columns: dict[str, list[Any]], lines: list[int], units: dict[str, str],
+    odd: list[tuple[int, str]],
+) -> None:  # fmt: skip
+    (tmp_path / "log.csv").write_text(text, encoding="utf-8")
+    rows = read_rows(tmp_path / "log.csv", **how)
+    assert rows.frame.astype(object).where(rows.frame.notna(), None).to_dict("list") == columns
+    assert rows.frame.index.tolist() == lines and rows.units == units
+    assert [(one.line, one.value) for one in [*rows.left_out, *chain(*rows.marks.values())]] == odd
+
+
+def test_a_counter_that_begins_again_counts_on_and_pauses_are_several_steps() -> None:
+    np.testing.assert_array_equal(
+        unwrapped(np.array([65534.0, np.nan, 65535, 0, 1]))[0], [65534, np.nan, 65535, 65536, 65537]
+    )
+    assert unwrapped(np.array([2.0**32 - 1, 0.0, 1.0]))[1].startswith(
+        "; its counter of 32 bits begins again at 0 (1 time)"
+    )
+    falling = np.array([65535.0, 60000.0, 60001.0, 60002.0])
+    assert unwrapped(falling) == (pytest.approx(falling), "")
+    assert _usual_step_s(np.array([0.0, 10.0, 20.0, 30.0, 100.0])) == 10.0
 
 
 def test_drivers_are_sorted_and_bad_lines_listed(tmp_path: Path) -> None:
@@ -278,13 +333,15 @@ def test_runs_are_joined_in_the_order_of_their_times(tmp_path: Path) -> None:
 
 
 def test_kelvins_around_zero_are_a_rise_and_a_stated_range_says_what_is_no_reading(tmp_path: Path) -> None:
-    rows = [f"{k},{0.05 * k - 0.02},{293.15 + k},{950.0 if k == 7 else 20.0 + k},{k},0" for k in range(10)]
+    rows = [
+        f"{k},{0.05 * k - 0.02},{293.15 + k},{950.0 if k == 7 else 20.0 + k - 99.0 * (k == 8)},{k},0" for k in range(10)
+    ]
     content = "\n".join(["time [min],t1 rise [K],t2 [K],t3 [degC],ch1 [um],spindle [1/min]", *rows])
     more = '[record.columns]\n"t3*" = {unit = "degC", range = ["-20 degC", "300 degC"]}'
     data = read_record(load_campaign(record(tmp_path, content, more=more)))
     np.testing.assert_allclose(data["temperature"].values[:, 0], 0.05 * np.arange(10) - 0.02)
     np.testing.assert_allclose(data["temperature"].values[:, 1], 20.0 + np.arange(10))
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(data["temperature"].values[:, 2])), [7])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(data["temperature"].values[:, 2])), [7, 8])
     assert json.loads(data.attrs["rises"]) == ["t1 rise"]
 
 
