@@ -680,11 +680,14 @@ def _is_read(text: str, order: tables.DateOrder) -> bool:
 def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> Column:
     """Propose role and unit of a column from its unit, the words of its heading, and its values."""
     name, in_heading = name_and_unit(heading)
-    of_place = "[" not in heading and not is_unit(in_heading) and (in_heading.isdecimal() or in_heading.isalpha())
-    if of_place and in_heading.casefold() not in _NO_UNITS and _word(name)[1] != "displacement":
+    word, role = _word(name)
+    # 1 is a unit, but of no temperature.
+    is_apart = not is_unit(in_heading) or (role == "temperature" and in_heading == "1")
+    of_place = "[" not in heading and is_apart and (in_heading.isdecimal() or in_heading.isalpha())
+    if of_place and in_heading.casefold() not in _NO_UNITS and role != "displacement":
         in_heading = ""  # TC(1), T (air): a number or a word, no unit
     # What the last word of a name means depends on the others: in is an inlet beside a temperature.
-    suffixes = _SUFFIXES | _SUFFIXES_OF.get(_word(name)[1], {})
+    suffixes = _SUFFIXES | _SUFFIXES_OF.get(role, {})
     behind = tables.read_heading(name).unit
     share = behind.name if behind is not None and SHARE.search(name) else ""
     ending = share or suffixes.get(
@@ -698,7 +701,6 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     low, high = float(numbers.min()), float(numbers.max())
     known = Column(heading, "out", unit, first, low, high, told=told)
     warm = 12.0 < float(np.median(numbers)) < 80.0 and not (numbers == np.round(numbers)).all()
-    word, role = _word(name)
     if word in _COUNTING and unit in _OF_SPEED:
         role = ""  # n in 1/min is a speed
     if role == "spread" or _SPREAD.search(name):
@@ -733,7 +735,9 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
             return replace(known, remark="a time" if kind == "time" else "no load")
         if role == "displacement" and unit in _OF_SIGNALS:
             return replace(known, remark=UNIT_NOT_KNOWN)
-        if role == "displacement" and '"' in heading and of_unit == "driver":
+        if (role == "displacement" and '"' in heading and of_unit == "driver") or (
+            role in ("temperature", "displacement") and unit == "1"
+        ):
             return replace(known, role=role, remark=UNIT_NOT_KNOWN)
         if role == "temperature" and of_unit == "displacement" and (len(word) > 2 or unit in ("m", "in")):
             return replace(known, role=role, remark=UNIT_NOT_KNOWN)

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from fusion.campaign.columns import ColumnsError, propose_table
+from fusion.campaign.columns import ColumnsError, _column, _is_mark, _place_times, _power_on, propose_table
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.draft import Asker, DraftError, write_campaign
 from fusion.campaign.inputs import read_record
@@ -661,6 +661,7 @@ ALIGNED = {
         # Channels that are called by numbers are no values.
         ("Time,101,102,103,104", ["102", "104"], [], ("101", "102", "103", "104")),
         ("Time,X,T bed,Y,T (air)", ["T bed", "T (air)"], ["X", "Y"], ("X", "T bed", "Y", "T (air)")),
+        ("Time,X,TC(1),Y,TC(2)", ["TC(1)", "TC(2)"], ["X", "Y"], ("X", "TC(1)", "Y", "TC(2)")),
         # Balances in kg have the numbers of temperatures.
         ("Time,X [um],Net(1),Y [furlong],T1 [degC]", ["T1 [degC]"], ["X [um]", "Y [furlong]"], ()),
     ],
@@ -939,4 +940,77 @@ def test_a_logger_of_japan_is_read_in_its_code_page(tmp_path: Path) -> None:
     table = propose_table(tmp_path / "log.csv")
     assert [(one.heading, one.role) for one in table.columns] == [
         ("日付", "time"), ("時刻", "time"), ("主軸温度", "temperature"), ("軸受温度", "temperature"), ("変位(mm)", "displacement"),
+    ]  # fmt: skip
+
+
+GROWS = np.arange(100.0)
+
+
+@pytest.mark.parametrize(
+    ("heading", "numbers", "role", "unit", "remark"),
+    [
+        ("T1", 11.0 + GROWS / 100, "temperature", "degC", "unit by its values"),
+        ("T bath", 251.0 + GROWS, "temperature", "K", "unit by its values"),
+        ("T bath", 250.0 + GROWS, "temperature", "degC", "unit by its values"),
+        ("T bath", 351.0 + GROWS, "temperature", "degC", "unit by its values"),
+        ("A1", 20.0 + GROWS / 100, "out", "", "by its values"),
+        ("A1", 20.0 + GROWS, "out", "", "not known"),
+        ("A1", 79.6 + GROWS / 100, "out", "", "not known"),
+        ("A1", 11.4 + GROWS / 100, "out", "", "not known"),
+        ("A1", GROWS / 1e6, "displacement", "m", "unit by its values"),
+        ("Z", 0.5 + 2.0 * GROWS / 99, "displacement", "um", "unit by its values"),
+        ("Z", 2e-3 * GROWS / 98, "displacement", "mm", "unit by its values"),
+        ("Z", 2e-3 * GROWS / 100, "displacement", "m", "unit by its values"),
+        ("Z", GROWS, "displacement", "um", "whole numbers: counts? then one count with its unit, as 0.0125 mm"),
+        ("Z", 0.0 * GROWS, "out", "", "constant"),
+        ("Z [V]", GROWS / 9, "out", "V", "unit not known"),
+        ("Z_um", GROWS / 9, "displacement", "um", ""),
+        ("X [mm]", 20.0 * GROWS / 99, "displacement", "mm", ""),
+        ("X [mm]", 20.0 * GROWS / 98, "out", "mm", "moves farther than 20 mm: no thermal displacement"),
+        ("T1 [degC]", 20.0 + 0.0 * GROWS, "temperature", "degC", ""),
+        ("TC(1)", 20.0 + GROWS / 100, "temperature", "degC", "unit by its values"),
+        ("T[1]", 20.0 + GROWS / 100, "temperature", "1", "unit not known"),
+        ("Z(1)", 20.0 + GROWS / 100, "displacement", "1", "unit not known"),
+        ("duty (1)", GROWS / 100, "driver", "1", ""),
+        ("n [1/min]", GROWS, "driver", "1/min", ""),
+        ("n", GROWS, "out", "", ""),
+        ("RPM", GROWS, "driver", "1/min", ""),
+        ("Z", GROWS[:0], "out", "", "no numbers"),
+    ],
+)  # fmt: skip
+def test_role_and_unit_of_a_column(heading: str, numbers: np.ndarray, role: str, unit: str, remark: str) -> None:
+    found = _column(heading, "", pd.Series(numbers), numbers)
+    assert (found.role, found.unit, found.remark) == (role, unit, remark)
+    assert not numbers.size or (found.low, found.high) == (numbers.min(), numbers.max())
+
+
+@pytest.mark.parametrize(
+    ("heading", "numbers", "keys", "asked"),
+    [
+        ("t", [0.0, 1800.0], {"time_unit": "s"}, ["time_unit"]),
+        ("t", [0.0, 1799.0], {"time_unit": "min"}, ["time_unit"]),
+        ("t", [0.0, 25.0], {"time_unit": "h"}, ["time_unit"]),
+        ("t", [0.0, 2e7], {"time_unit": "ms"}, ["time_unit"]),
+        ("t", [85958.0, 100002.0], {"time_format": "%H%M%S"}, ["time_format"]),
+        ("t", [1.7e9, 1.7e9 + 60], {"start": "1970-01-01T00:00:00Z", "time_unit": "s"}, []),
+        ("t", [1.7e12, 1.7e12 + 6e4], {"start": "1970-01-01T00:00:00Z", "time_unit": "ms"}, []),
+        ("t", [3.8e9, 3.8e9 + 60], {"start": "1904-01-01T00:00:00Z", "time_unit": "s"}, ["start"]),
+        ("GPS", [1.4e9, 1.4e9 + 60], {"start": "1980-01-05T23:59:42Z", "time_unit": "s"}, []),
+    ],
+)
+def test_times_that_are_numbers_are_placed(
+    heading: str, numbers: list[float], keys: dict[str, str], asked: list[str]
+) -> None:
+    found: tuple[dict[str, str], dict[str, str]] = {}, {}
+    _place_times(heading, np.array(numbers), "", *found)
+    assert (found[0], list(found[1])) == (keys, asked)
+
+
+def test_a_number_far_from_all_others_is_a_mark_and_85_degrees_among_others_a_sensor_at_its_start() -> None:
+    assert [_is_mark(-999.0, np.array(one)) for one in ([20.0, -999.0], [-940.0, -999.0], [-960.0, -999.0], [1.0])] == [
+        True, True, False, False,
+    ]  # fmt: skip
+    assert _is_mark(-999.0, np.array([-999.0]))
+    assert [_power_on(np.array(one)) for one in ([20.0, 85.0, 21.0], [80.0, 85.0, 84.0], [20.0, 20.0, 185.0], [85.0, 20.0])] == [
+        85.0, 0.0, 185.0, 0.0,
     ]  # fmt: skip
