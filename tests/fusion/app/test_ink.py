@@ -2,6 +2,7 @@
 
 import io
 import shutil
+from functools import cache
 
 import numpy as np
 import pytest
@@ -31,10 +32,25 @@ PLACES = """all => all.map((one) => {
 })"""
 
 
+@pytest.fixture(scope="module")
+def first_screen(app, new_page):
+    """Return a function that opens the first screen in some colours and some width, once; there are two results to compare."""
+    shutil.copytree(app[1] / "results", app[1] / "again")
+
+    @cache
+    def open_page(scheme, width):
+        page = new_page(app[0], width=width, color_scheme=scheme)
+        page.get_by_text("12 fiducials agree").wait_for()
+        return page
+
+    return open_page
+
+
 @pytest.mark.browser
-def test_drop_zone_menus_and_number_fields_are_seen_on_a_dark_page(app, new_page):
-    page = new_page(app[0], width=1400, color_scheme="dark")
-    page.get_by_text("12 fiducials agree").wait_for()
+def test_drop_zone_menus_and_number_fields_are_seen_on_a_dark_page(first_screen):
+    page = first_screen("light", 1400)
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_timeout(1000)
 
     def shot(part) -> np.ndarray:
         return np.asarray(Image.open(io.BytesIO(part.screenshot())).convert("L"), int)
@@ -44,6 +60,7 @@ def test_drop_zone_menus_and_number_fields_are_seen_on_a_dark_page(app, new_page
     for field in (page.get_by_label("Fiducial", exact=True), page.get_by_label("x on the plan (mm)").first):
         arrow = shot(field)[6:-6, -24:-4]
         assert np.median(arrow) < 60 and arrow.max() > 150, "a light arrow on a dark field"
+    page.emulate_media(color_scheme="light")
 
 
 # Colours do not depend on the width, nor places on the theme: a desktop in the light, a phone in the dark.
@@ -51,11 +68,8 @@ def test_drop_zone_menus_and_number_fields_are_seen_on_a_dark_page(app, new_page
 @pytest.mark.parametrize(
     ("scheme", "width"), [("light", 1400), pytest.param("dark", 390, marks=pytest.mark.slow)], ids=["desktop", "phone"]
 )
-def test_every_chart_has_ink(app, new_page, scheme, width):
-    # Two results, so that there is something to compare.
-    shutil.copytree(app[1] / "results", app[1] / "again", dirs_exist_ok=True)
-    page = new_page(app[0], width=width, color_scheme=scheme)
-    page.get_by_text("12 fiducials agree").wait_for()
+def test_every_chart_has_ink(first_screen, scheme, width):
+    page = first_screen(scheme, width)
 
     def charts_have_ink(least: int) -> None:
         page.wait_for_timeout(900)

@@ -27,7 +27,9 @@ def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(app,
 
 
 @pytest.mark.browser
-def test_a_browser_is_led_by_a_file_of_the_user_and_no_argument_holds_the_token(app, new_page, tmp_path, monkeypatch):
+def test_a_browser_is_led_to_the_first_screen_by_a_file_of_the_user_and_no_argument_or_address_holds_the_token(
+    app, new_page, tmp_path, monkeypatch
+):
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
@@ -37,9 +39,14 @@ def test_a_browser_is_led_by_a_file_of_the_user_and_no_argument_holds_the_token(
         page = new_page("about:blank").context.browser.new_context().new_page()
         assert page.goto(app[0].split("/?")[0]).status == 403
         page.goto(file.as_uri())
-        page.get_by_role("heading", name="Set up").wait_for()
-        assert "token" not in page.url
+        page.get_by_role("heading", name=next(iter(SCREENS)), exact=True).wait_for()
+        assert page.title() == "thermofuse" and "token" not in page.url
     assert not file.exists()
+    assert page.context.request.get(page.url).ok, "another tab needs no token"
+    # Results of one test are nothing to compare.
+    page.get_by_role("button", name="Live", exact=True).wait_for()
+    shown = [name for name in SCREENS if page.get_by_role("button", name=name, exact=True).count()]
+    assert shown == ["Set up", "Run", "Results", "Live"]
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -172,17 +179,6 @@ def test_credentials_are_long_and_new_for_every_server():
     assert OWN.address == f"http://127.0.0.1:8765/?token={OWN.token}"
 
 
-def test_the_address_opens_the_first_screen_and_the_token_leaves_the_address(app, new_page):
-    page = new_page(app[0])
-    assert page.title() == "thermofuse" and "token" not in page.url
-    page.get_by_role("heading", name=next(iter(SCREENS)), exact=True).wait_for()
-    # Results of one test are nothing to compare.
-    page.get_by_role("button", name="Live", exact=True).wait_for()
-    shown = [name for name in SCREENS if page.get_by_role("button", name=name, exact=True).count()]
-    assert shown == ["Set up", "Run", "Results", "Live"]
-    assert page.context.request.get(page.url).ok, "another tab needs no token"
-
-
 def test_no_screen_breaks_a_rule_of_accessibility_in_the_light_or_the_dark_or_scrolls_sideways_on_a_phone(
     app, new_page
 ):
@@ -191,6 +187,7 @@ def test_no_screen_breaks_a_rule_of_accessibility_in_the_light_or_the_dark_or_sc
     if not (app[1] / "before").exists():
         shutil.copytree(app[1] / "results", app[1] / "before")
     page = new_page(app[0], width=390, bypass_csp=True)
+    assert "token" not in page.url
     page.get_by_text("12 fiducials agree").wait_for()
     page.get_by_role("button", name="Compare", exact=True).wait_for()
     page.get_by_role("slider", name="Camera clock minus laser clock (s)").wait_for()
