@@ -73,6 +73,10 @@ _ALSO = {
         ("fusion/analysis/consistency/camera.py", "fusion/analysis/consistency/deviations.py"),
         ("tests/fusion/analysis/consistency/test_every_check.py",),
     ),
+    # A record reduced, fitted and told.
+    "fusion/analysis/drift_model/record.py": tuple(
+        f"tests/fusion/analysis/drift_model/test_record_{part}.py" for part in ("fit", "result", "data")
+    ),
     # The end of the search, and the scorer of candidates.
     "fusion/analysis/drift_model/search.py": ("tests/fusion/analysis/drift_model/test_evaluation.py",),
     "fusion/analysis/drift_model/admissibility.py": ("tests/fusion/analysis/drift_model/test_gains.py",),
