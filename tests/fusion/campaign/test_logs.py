@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
@@ -18,6 +19,7 @@ from fusion.campaign.inputs import pipe_notices, read_record
 from fusion.campaign.logs import (
     ContactSensors,
     TableError,
+    _formatted_times,
     _usual_step_s,
     read_drivers,
     read_rows,
@@ -82,6 +84,22 @@ def test_rows_of_a_text(
     assert rows.frame.astype(object).where(rows.frame.notna(), None).to_dict("list") == columns
     assert rows.frame.index.tolist() == lines and rows.units == units
     assert [(one.line, one.value) for one in [*rows.left_out, *chain(*rows.marks.values())]] == odd
+
+
+@pytest.mark.parametrize(
+    ("form", "texts", "seconds"),
+    [
+        ("%H%M%S", ["93005.0", "235959", "000001"], [34205, 86399, 86401]),
+        ("%H:%M:%S", ["23:59:59", "24:00:01"], [86399, 86401]),
+        ("%M:%S", ["59:59", "60:01"], [3599, 3601]),
+        ("%d.%m.%Y %H:%M", ["02.01.1970 00:01", "?"], [86460, None]),
+    ],
+)
+def test_times_of_a_stated_form_count_on_over_midnight(form: str, texts: list[str], seconds: list[int | None]) -> None:
+    stated = DriversTable(file="log.csv", time="t", time_format=form)
+    expected = ["NaT" if one is None else np.datetime64(one, "s") for one in seconds]
+    found, _ = _formatted_times(Path("log.csv"), pd.Series(texts), stated)
+    np.testing.assert_array_equal(found, np.array(expected, "M8[ns]"))
 
 
 def test_a_counter_that_begins_again_counts_on_and_pauses_are_several_steps() -> None:

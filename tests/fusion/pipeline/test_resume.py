@@ -85,9 +85,11 @@ def test_a_stage_is_kept_until_its_table_or_a_file_of_it_or_the_one_before_chang
         assert run.parts == PARTS and run.notices == [Notice("code", "said", "remedy")] * 2
         assert [path.name for path in run.products] == ["deviations.nc", "model.nc"]
     text = (copied / "campaign.toml").read_text()
+    other = re.sub("dead_path = .*", 'dead_path = "300 mm"', text)
     for changed, times in (
         (text.replace("title = ", "title = 'b' # "), 2),
-        (re.sub("dead_path = .*", 'dead_path = "300 mm"', text), 3),
+        (other, 3),
+        (other.replace("title = ", "time_zone = 'Europe/Vienna'\ntitle = "), 4),
     ):
         assert changed != text
         (copied / "campaign.toml").write_text(changed)
@@ -241,15 +243,20 @@ def test_the_campaign_file_is_found_from_the_results_without_naming_folders_of_t
     campaign = load_campaign(campaign_folder / "campaign.toml")
     run = describe_run(campaign, {}, campaign.folder / folder, started=STARTED, seconds={})
     assert run["campaign_file"] == (None if place is None else place.format(campaign.folder.name))
+    fetched = describe_run(campaign, {}, campaign.folder / folder, started=STARTED, seconds={}, address="s3://mill")
+    assert fetched["campaign_file"] is None and fetched["campaign_address"] == "s3://mill"
+    assert "campaign_address" not in run
 
 
 def test_inputs_that_change_during_a_run_are_told():
     before = {name: FileState(100, 1) for name in ("laser.csv", "a.jpg", "b.jpg", "c.jpg", "d.jpg")}
-    after = {"laser.csv": FileState(140, 2), "e.jpg": FileState(100, 1)}
+    after = {"laser.csv": FileState(140, 2)} | dict.fromkeys(("e.jpg", "f.jpg", "g.jpg"), FileState(100, 1))
     assert list(note_changes(before, before)) == []
     (notice,) = note_changes(before, after)
     assert notice.code == "inputs_changed"
-    assert "1 changed (laser.csv); 4 removed (a.jpg, b.jpg, c.jpg, ...); 1 added (e.jpg)" in notice.message
+    assert (
+        "1 changed (laser.csv); 4 removed (a.jpg, b.jpg, c.jpg, ...); 3 added (e.jpg, f.jpg, g.jpg)" in notice.message
+    )
 
 
 def test_the_state_of_inputs_is_seen_without_reading_them(copied):
