@@ -584,7 +584,7 @@ def _read_text(path: Path, header: HeaderRows | None) -> Rows:
     if header is None:
         before, _ = tables.find_header(lines)
         header = HeaderRows(names=before + 1, values=before + 2)
-    below = ["\n" if line.startswith("#") else line for line in lines[header.values - 1 :]]
+    below = lines[header.values - 1 :]
     if header.names:
         names = "".join(lines[header.names - 1 : header.names])
         values = max(below[:_SAMPLE], key=len, default="")
