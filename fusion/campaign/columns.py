@@ -712,38 +712,49 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
             return replace(known, remark="set point" if place else "constant")
         return replace(known, role="driver", unit=unit or "1", remark="set point")
     if unit:
-        of_unit = role_of_unit(unit)
-        if role in ("temperature", "displacement") and _RATE.fullmatch(unit) and not is_unit(unit):
-            return replace(known, remark="a rate")
-        if of_unit == "temperature" and low == high and numbers.size > logs.HEAD:
-            # What a logger writes for a sensor that is not there, and nothing that a drift could follow.
-            return replace(known, remark="constant")
-        if of_unit == "displacement" and (high - low) * column_conversion(unit, "mm")[0] > _FARTHEST_MM:
-            return replace(known, remark=f"moves farther than {_FARTHEST_MM:g} mm: no thermal displacement")
-        if of_unit == "driver" and not is_unit(unit) and role != "driver":
-            # A factor whose sense is not known stands beside the unit.
-            of_rest = role_of_unit(_FACTOR.sub("", unit).strip())
-            return replace(
-                known, role=role or ("out" if of_rest == "driver" else of_rest), unit=unit, remark=UNIT_NOT_KNOWN
-            )
-        found = find_unit(unit) if of_unit == "driver" and role != "driver" else None
-        kind = found.kind if found is not None else ""
-        if unit == "deg" and kind and warm:
-            # "Grad" and "°" alone may be degrees Celsius.
-            return replace(known, role=role or "temperature", remark=UNIT_NOT_KNOWN)
-        if kind in ("angle", "time") or unit in ("um/m", "µm/m"):
-            return replace(known, remark="a time" if kind == "time" else "no load")
-        if role == "displacement" and unit in _OF_SIGNALS:
-            return replace(known, remark=UNIT_NOT_KNOWN)
-        if (role == "displacement" and '"' in heading and of_unit == "driver") or (
-            role in ("temperature", "displacement") and unit == "1"
-        ):
-            return replace(known, role=role, remark=UNIT_NOT_KNOWN)
-        if role == "temperature" and of_unit == "displacement" and (len(word) > 2 or unit in ("m", "in")):
-            return replace(known, role=role, remark=UNIT_NOT_KNOWN)
-        # Of a logger "Last" is the last reading, and no load.
-        taken = role == "out" or (role == "driver" and of_unit == "displacement" and word != "last")
-        return replace(known, role=role if taken and of_unit != "temperature" else of_unit)
+        return _by_unit(known, word, role, warm=warm, count=numbers.size)
+    return _by_name(known, name, word, role, warm=warm)
+
+
+def _by_unit(known: Column, word: str, role: str, *, warm: bool, count: int) -> Column:
+    """Give a column that states a unit its role: that of the unit, unless its name says otherwise."""
+    unit, low, high = known.unit, known.low, known.high
+    of_unit = role_of_unit(unit)
+    if role in ("temperature", "displacement") and _RATE.fullmatch(unit) and not is_unit(unit):
+        return replace(known, remark="a rate")
+    if of_unit == "temperature" and low == high and count > logs.HEAD:
+        # What a logger writes for a sensor that is not there, and nothing that a drift could follow.
+        return replace(known, remark="constant")
+    if of_unit == "displacement" and (high - low) * column_conversion(unit, "mm")[0] > _FARTHEST_MM:
+        return replace(known, remark=f"moves farther than {_FARTHEST_MM:g} mm: no thermal displacement")
+    if of_unit == "driver" and not is_unit(unit) and role != "driver":
+        # A factor whose sense is not known stands beside the unit.
+        of_rest = role_of_unit(_FACTOR.sub("", unit).strip())
+        return replace(known, role=role or ("out" if of_rest == "driver" else of_rest), remark=UNIT_NOT_KNOWN)
+    found = find_unit(unit) if of_unit == "driver" and role != "driver" else None
+    kind = found.kind if found is not None else ""
+    if unit == "deg" and kind and warm:
+        # "Grad" and "°" alone may be degrees Celsius.
+        return replace(known, role=role or "temperature", remark=UNIT_NOT_KNOWN)
+    if kind in ("angle", "time") or unit in ("um/m", "µm/m"):
+        return replace(known, remark="a time" if kind == "time" else "no load")
+    if role == "displacement" and unit in _OF_SIGNALS:
+        return replace(known, remark=UNIT_NOT_KNOWN)
+    of_another = (
+        (role in ("temperature", "displacement") and unit == "1")
+        or (role == "displacement" and of_unit == "driver" and '"' in known.heading)
+        or (role == "temperature" and of_unit == "displacement" and (len(word) > 2 or unit in ("m", "in")))
+    )
+    if of_another:
+        return replace(known, role=role, remark=UNIT_NOT_KNOWN)
+    # Of a logger "Last" is the last reading, and no load.
+    taken = role == "out" or (role == "driver" and of_unit == "displacement" and word != "last")
+    return replace(known, role=role if taken and of_unit != "temperature" else of_unit)
+
+
+def _by_name(known: Column, name: str, word: str, role: str, *, warm: bool) -> Column:
+    """Give a column without a unit the role of its name, else of its values, and the unit that is usual there."""
+    low, high = known.low, known.high
     if role == "out":
         return known
     if role in ("temperature", "displacement") and any(map(has_unit, re.findall(r"[\[(]([^\])]*)", name))):
