@@ -254,17 +254,14 @@ def _not_used(content: FolderContent, lines: Sequence[str]) -> Iterator[str]:
     if left or content.unknown:
         yield from ("", _NOT_USED)
         offered = "; [drivers] above names it in comments"
-        for one in left:
-            name, words = content.relative(one.path), f"{one.kind.value.words}{one.kind.value.unused}"
-            if _logs_temperatures(one):
+        for one in (*left, *content.unknown):
+            name, words = (
+                content.relative(one.path),
+                _plain(one.reason) or f"{one.kind.value.words}{one.kind.value.unused}",
+            )
+            if one.temperatures is not None:
                 words = f"temperatures without a displacement{offered if f'# file = {_quoted(name)}' in lines else ''}"
             yield f"#   {_plain(name)}: {words}"
-        yield from (f"#   {_plain(content.relative(one.path))}: {_plain(one.reason)}" for one in content.unknown)
-
-
-def _logs_temperatures(found: Recognised) -> bool:
-    """Whether a file is a log of temperatures, as of the air, without a displacement."""
-    return found.kind is Kind.RECORD and found.content.lacking == ["displacement"]
 
 
 def _axis(readings: Recognised, asker: Asker) -> Iterator[str]:
@@ -505,8 +502,12 @@ def _drivers(content: FolderContent) -> Iterator[str]:
     if content.of(Kind.DRIVERS):
         yield from ("", "[drivers]")
         yield from _optional("file", content, Kind.DRIVERS)
-    elif logs := [one for one in content.of(Kind.RECORD) if _logs_temperatures(one) and "long" not in one.content.keys]:
-        table, name = logs[0].content, _quoted(content.relative(logs[0].path))
+    elif logs := [
+        (one.temperatures, _quoted(content.relative(one.path)))
+        for one in (*content.of(Kind.RECORD), *content.unknown)
+        if one.temperatures is not None and "long" not in one.temperatures.keys
+    ]:
+        table, name = logs[0]
         yield from (
             "",
             "# [drivers]                              # temperatures that the drift may follow: remove each # to use them",

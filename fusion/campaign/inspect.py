@@ -163,6 +163,13 @@ class Recognised:
         return self.kind.value.read(self.path)
 
     @property
+    def temperatures(self) -> TableProposal | None:
+        """Proposal for temperatures without a displacement, as a log of the air; None of a file that holds something else."""
+        # A file that is not understood may have failed before it was looked at as a table.
+        logged = vars(self).get("logged", "") if self.kind in (Kind.RECORD, Kind.UNKNOWN) else ""
+        return None if isinstance(logged, str) or logged.lacking != ["displacement"] else logged
+
+    @property
     def headings(self) -> tuple[str, ...]:
         """Headings of a record, as its first line or, where that holds none, its proposed columns have them."""
         return self.first_line if _names_a_record(self) else tuple(one.heading for one in self.content.columns)
@@ -315,15 +322,17 @@ def _logs_drivers(found: Recognised) -> bool:
 
 
 def _logs_environment(found: Recognised) -> bool:
-    from interferometry.io.readings import ENVIRONMENT_COLUMNS, is_environment_log
+    from interferometry.io.readings import ENVIRONMENT_COLUMNS, holds_environment, is_environment_log
     from interferometry.io.tables import read_heading
 
     if not is_environment_log(found.path):
         return False
-    # A record may log the air pressure too; it has columns beside air and material.
-    roles = {read_heading(name).role for name in found.first_line}
-    alone = roles <= {"time", *(name for _, name, *_ in ENVIRONMENT_COLUMNS)}
-    return alone or isinstance(found.logged, str) or bool(found.logged.lacks)
+    whole, roles = holds_environment(found.path), {read_heading(name).role for name in found.first_line}
+    if whole and roles <= {"time", *(name for _, name, *_ in ENVIRONMENT_COLUMNS)}:
+        return True
+    # A record may log the air pressure too; and temperatures beside it that lack what a laser needs are a series that drift may follow.
+    logged = found.logged
+    return isinstance(logged, str) or (bool(logged.lacks) and (whole or logged.lacking != ["displacement"]))
 
 
 def _holds_deviations(found: Recognised) -> bool:

@@ -1284,6 +1284,13 @@ def is_environment_log(path: Path) -> bool:
     return any({"air_temperature", "air_pressure"} & found and not {"deviation", "measured"} & found for found in roles)
 
 
+def holds_environment(path: Path) -> bool:
+    """Return whether a log of air and material has all columns that the compensation of a laser needs."""
+    with suppress(LaserFormatError):
+        return bool(_environment_table(path))
+    return False
+
+
 def read_environment(path: str | Path) -> xr.Dataset:
     r"""Read logged air and material conditions from delimited text or a spreadsheet.
 

@@ -280,21 +280,35 @@ def test_loggers_in_files_of_their_own_are_told_to_be_one_table(tmp_path):
         write_campaign(tmp_path, Asker(None))
 
 
-def test_a_log_of_temperatures_beside_a_laser_is_offered_as_drivers(tmp_path):
-    """HOBO's export: channels that only their places tell apart, no displacement, and no material for an environment."""
+#: HOBO's export, with channels that only their places tell apart, and a sensor of the air: neither has the material of an environment.
+LOGS = {
+    "hobo": (
+        '"Plot Title: shop"\n"#","Date Time, GMT+00:00","Temp, °C (LGR S/N: 20750528, LBL: air)","Temp, °C (LGR S/N: 20750528, LBL: bed)"',
+        "{n},03/09/26 {h:02}:{m:02}:26 AM,{air:.3f},{bed:.3f}",
+        ("LBL: air", "LBL: bed"),
+    ),
+    "bme280": (
+        "Timestamp,Temperature (°C),Humidity (%),Pressure (hPa)",
+        "2026-03-09T{h:02}:{m:02}:26+00:00,{air:.2f},{bed:.1f},100{n}.5",
+        ("Temperature",),
+    ),
+}
+
+
+@pytest.mark.parametrize("log", LOGS)
+def test_a_log_of_temperatures_beside_a_laser_is_offered_as_drivers(tmp_path, log):
     folder = write_laser(tmp_path / "test", 5, 4).parent
     (folder / "campaign.toml").unlink()
-    channels = ",".join(f'"Temp, °C (LGR S/N: 20750528, LBL: {place})"' for place in ("air", "bed"))
-    rows = [
-        f"{k + 1},03/09/26 {6 + k // 60:02}:{k % 60:02}:26 AM,{21 + k / 99:.3f},{20 + k / 99:.3f}" for k in range(300)
-    ]
-    (folder / "hobo.csv").write_text("\n".join(['"Plot Title: shop"', f'"#","Date Time, GMT+00:00",{channels}', *rows]))
+    head, row, columns = LOGS[log]
+    rows = [row.format(n=k % 9, h=6 + k // 60, m=k % 60, air=21 + k / 99, bed=20 + k / 99) for k in range(300)]
+    (folder / f"{log}.csv").write_text("\n".join([head, *rows]))
     path, _ = write_campaign(folder, Asker(None))
-    assert "hobo.csv: temperatures without a displacement; [drivers] above names it in comments" in unused_files(path)
+    assert f"{log}.csv: temperatures without a displacement; [drivers] above names it in comments" in unused_files(path)
+    assert check_campaign(path).faults == ()
     above, below = path.read_text().split("# [drivers]")
     path.write_text(f"{above}[drivers]{below.replace(chr(10) + '# ', chr(10))}".split("Files in this folder")[0])
     read = check_campaign(path)
-    assert read.faults == () and any("LBL: air" in line and "LBL: bed" in line for line in read.lines())
+    assert read.faults == () and any(all(name in line for name in columns) for line in read.lines())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="names of files are bytes on POSIX systems only")
