@@ -19,6 +19,10 @@ def put(name: str, value: object) -> None:
     subprocess.run(["halcmd", "setp", name, str(value)], check=True)
 
 
+def told() -> list[float]:
+    return [pin(f"joint.0.{name}") for name in ("pos-cmd", "motor-pos-cmd", "motor-offset")]
+
+
 def wait(done, seconds: float = 10.0) -> None:
     end = time.monotonic() + seconds
     while not done() and time.monotonic() < end:
@@ -51,8 +55,12 @@ moved = []
 for x in asked["moves"]:
     command.mdi(f"G0 X{x}")
     command.wait_complete(20)
-    time.sleep(0.1)
-    moved.append([x, pin("joint.0.pos-cmd"), pin("joint.0.motor-pos-cmd"), pin("joint.0.motor-offset")])
+    # On a busy machine the command is called complete before the axis has come to rest, and its correction later still.
+    before, now = None, told()
+    while now != before or abs(now[0] - x) > 1e-3:
+        time.sleep(0.1)
+        before, now = now, told()
+    moved.append([x, *now])
 followed = []
 if asked["readings"]:
     put("axis.x.eoffset-enable", 1)
