@@ -40,10 +40,10 @@ lint: $(VENV)/.test
 test: $(VENV)/.test
 	@$(MAKE) --jobs 2 lint tests
 
-# Three processes for two cores, because a test with a browser or a control waits half of its time; files in the order of tests/conftest.py,
+# Four processes for two cores, because a test with a browser or a control waits half of its time; files in the order of tests/conftest.py,
 # which leaves the short ones to the end. One thread each for linear algebra: more would only wait for one another.
 tests: $(VENV)/.test
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
 
 # README's lines and Python and the cells of the tutorials, in a copy of the last commit with the environment that README's line makes.
 readme:
