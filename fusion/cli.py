@@ -692,7 +692,8 @@ def schema(
     schemas = {"results": results_schema, "campaign": campaign_schema, "recipe": recipe_schema}
     if name not in schemas:
         _refuse(f'there is no schema "{name}"; write results, campaign or recipe')
-    print_json(schemas[name]())
+    with _answering():
+        print_json(schemas[name]())
 
 
 @app.command()
@@ -861,7 +862,7 @@ def plan(
         Path | None, Option(help="RESULTS: write the schedule as an NC program of speeds and dwells.")
     ] = None,
     control: Annotated[str, Option(help="Control of --nc: linuxcnc, siemens840d or fanuc.")] = "linuxcnc",
-    seed: Annotated[int, Option(help="Another seed is another, equally valid schedule.")] = 0,
+    seed: Annotated[int, Option(min=0, help="Another seed is another, equally valid schedule.")] = 0,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Propose a random duty schedule for a new test.

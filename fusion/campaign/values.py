@@ -259,7 +259,7 @@ def _written(example: str) -> WithJsonSchema:
     return WithJsonSchema({"type": "string", "format": "quantity", "examples": [example]})
 
 
-Millimetres = Annotated[float, _quantity("mm"), _written("5 mm")]
+Millimetres = Annotated[float, _quantity("mm"), _within(-1e5, 1e5, "this length in mm"), _written("5 mm")]
 PositiveMillimetres = Annotated[float, _quantity("mm"), _within(0.0, 1e5, "this length in mm"), _written("5 mm")]
 Metres = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), _written("1.2 m")]
 Celsius = Annotated[float, _quantity("degC"), _within(-273.15, 3000.0, "a temperature in degC"), _written("22 degC")]
@@ -271,7 +271,7 @@ PartsPerMillion = Annotated[
     float, _quantity("ppm/K"), _within(-10.0, 200.0, "an expansion coefficient in ppm/K"), _written("11.7 ppm/K")
 ]
 Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in mm/min"), _written("300 mm/min")]
-Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
+Fraction = Annotated[float, BeforeValidator(_fraction), _within(1e-6, 1.0, "this fraction")]
 #: Standard uncertainties.
 FractionU = Annotated[
     float, BeforeValidator(_fraction), AfterValidator(_share_u), Field(json_schema_extra={"minimum": 0, "maximum": 1})

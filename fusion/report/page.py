@@ -202,7 +202,7 @@ def page_format(path: Path, *formats: str) -> str:
         raise PageFileError(f"{path} exists already; name another file with --out, or remove it")
     asked = ".html" if path.suffix.lower() == ".htm" else path.suffix.lower()
     if asked not in formats:
-        written = f"{', '.join(formats[:-1])} or {formats[-1]}"
+        written = " or ".join(filter(None, (", ".join(formats[:-1]), formats[-1])))
         raise PageFileError(f"{path}: it is written as {written}; name such a file with --out")
     return asked
 

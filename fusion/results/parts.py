@@ -19,7 +19,7 @@ from typing import Annotated, Literal, TypeGuard
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -540,6 +540,10 @@ class TablePredictionError(FusionError):
     """A prediction that cannot be read; the message names the file and what to do."""
 
 
+#: Positions in mm and corrections in um are below it.
+_LARGEST_IN_TABLE = 1e5
+
+
 class TablePrediction(ResultPart):
     """Values by ISO 230-2 that a test of the same axis with an active table is predicted to show."""
 
@@ -561,6 +565,15 @@ class TablePrediction(ResultPart):
     """A, E, M and B of ISO 230-2, um; their uncertainty is that of table and readings, without what both tests have in common."""
     not_predicted: str = ""
     """Why nothing is predicted; empty where it is."""
+
+    @model_validator(mode="after")
+    def _of_an_axis(self) -> TablePrediction:
+        """Refuse what no table of an axis holds, as a file that was damaged does."""
+        predicted = [number for one in self.predicted_um.values() for number in (one.value, one.u)]
+        numbers = [*self.position_mm, *self.correction_um.values(), *filter(None, predicted)]
+        if not max(map(abs, numbers), default=0.0) < _LARGEST_IN_TABLE:
+            raise ValueError(f"a position, correction or prediction is not below {_LARGEST_IN_TABLE:g}")
+        return self
 
     def correction_at(self, position_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what the table takes out by the positive and by the negative approach, um, at positions (n,), mm."""

@@ -228,6 +228,10 @@ class DutyPlanError(FusionError):
     """A schedule that cannot be proposed; the message says why."""
 
 
+#: What a machine may have: times in s, sizes in um; a test of cycles shorter than these would fill the memory.
+_TIMES_S, _SIZES_UM, _CYCLES_S = (1.0, 1e6), (1e-4, 1e4), (30.0, 1e5)
+
+
 @dataclass(frozen=True)
 class Machine:
     """Machine and measurement as expected before the test.
@@ -254,11 +258,14 @@ class Machine:
         repeated = next((name for name in self.sources if self.sources.count(name) > 1), None)
         if repeated is not None:
             raise DutyPlanError(f"source {repeated!r} is named more than once; name every source once")
-        values = {f"time constant of {name}": s for name, s in zip(self.sources, self.time_constants_s, strict=True)}
-        values |= {"effect": self.effect_um, "noise": self.noise_um, "cycle": self.cycle_s}
-        wrong = next((name for name, value in values.items() if not value > 0.0), None)
-        if wrong is not None:
-            raise DutyPlanError(f"{wrong}: {values[wrong]:g} is not greater than 0; give what the machine has")
+        values = [
+            (f"time constant of {name}", s, *_TIMES_S)
+            for name, s in zip(self.sources, self.time_constants_s, strict=True)
+        ]
+        values += [(name, um, *_SIZES_UM) for name, um in (("effect", self.effect_um), ("noise", self.noise_um))]
+        for name, value, low, high in (*values, ("cycle", self.cycle_s, *_CYCLES_S)):
+            if not low <= value <= high:
+                raise DutyPlanError(f"{name}: {value:g} lies outside {low:g} to {high:g}; give what the machine has")
 
 
 def plan_duty(

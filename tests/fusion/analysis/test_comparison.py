@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from pydantic import ValidationError
 
 from fusion.analysis.comparison import (
     Change,
@@ -364,6 +365,12 @@ def table_of(size_um: float) -> TablePrediction:
     return TablePrediction(
         table="x.comp", campaign="", results_sha256="0" * 64, cycles=5, predicted_um={}, position_mm=tuple(at), correction_um=sides
     )  # fmt: skip
+
+
+def test_a_table_of_metres_is_damaged():
+    assert table_of(9e4).correction_um.positive[0] == pytest.approx(-9e4)
+    with pytest.raises(ValidationError, match="is not below 100000"):
+        table_of(1e308)
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,7 @@ def test_a_value_comes_in_the_unit_of_its_name(name: str, written: Any, value: A
 @pytest.mark.parametrize(
     ("name", "beyond", "limits"),
     [
+        ("Millimetres", "-1e5 mm", ["0 mm", "1e5 mm"]),
         ("PositiveMillimetres", "0 mm", ["1e5 mm"]),
         ("Celsius", "0 K", ["3000 degC"]),
         ("Seconds", "-3e9 s", ["-1 s", "3e9 s"]),
@@ -106,7 +107,7 @@ def test_a_value_comes_in_the_unit_of_its_name(name: str, written: Any, value: A
         ("PositiveMicrometres", "0 um", ["1e6 um"]),
         ("PartsPerMillion", "-10 ppm/K", ["-9 ppm/K", "200 ppm/K"]),
         ("Feed", "0 mm/min", ["1e6 mm/min"]),
-        ("Fraction", "0 %", ["100 %"]),
+        ("Fraction", "0.0001 %", ["0.001 %", "100 %"]),
         ("FractionU", "-1", ["0 %", "100 %"]),
         ("PartsPerMillionU", "0.001 ppm/K", ["200 ppm/K"]),
         ("KelvinU", "-1 K", ["0 K"]),
