@@ -34,7 +34,14 @@ def written(path: Path, kind: str) -> Path:
                 file.create_group(f"g{number}")
         elif kind == "circle":
             file["deep/er/again"] = file["deep"]
+        elif kind == "branches":
+            for level in range(10):
+                file.create_group(f"{level}")
+                for branch in "abc":
+                    file[f"{level}/{branch}"] = h5py.SoftLink(f"/{level + 1}")
+        elif kind == "twice":
             file["temperature"] = np.full(SHAPE, 20.0)
+            file["again"], file["er"] = file["temperature"], h5py.SoftLink("/deep/er")
     return path
 
 
@@ -46,6 +53,8 @@ def written(path: Path, kind: str) -> Path:
         ("link", "deep/temperature is in another file"),
         ("sparse", "temperature states 1.29e+03 GB, more than the file holds"),
         ("many", "it holds more than 1000 datasets and groups"),
+        ("circle", "it nests groups more than 20 deep"),
+        ("branches", "it holds more than 1000 datasets and groups"),
     ],
 )
 def test_what_the_library_would_read_is_refused(tmp_path, kind, told):
@@ -58,7 +67,7 @@ def test_what_the_library_would_read_is_refused(tmp_path, kind, told):
 
 
 def test_a_file_that_holds_its_values_is_read(tmp_path):
-    assert hdf5_fault(written(tmp_path / "a.nc", "circle")) == ""
+    assert hdf5_fault(written(tmp_path / "a.nc", "twice")) == ""
 
 
 @pytest.mark.parametrize("shape", [(5,), (24,), (3, 7)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import secrets
@@ -152,7 +153,7 @@ def _as_float32(path: Path, name: str, values: NDArray[np.floating]) -> NDArray[
 _LARGE_BYTES, _MOST_PACKED = 1_000_000_000, 1_100
 #: Datasets and groups of a file: the products of a run have up to 150, and each costs a reader a millisecond whenever it opens the file.
 MOST_OBJECTS = 1_000
-#: Groups within one another; deeper ones take a reader minutes.
+#: Groups within one another; deeper ones take a reader minutes, and a group that is linked within itself for ever.
 _MOST_NESTED = 20
 
 
@@ -161,26 +162,31 @@ def hdf5_fault(path: Path) -> str:
     # Loaded with the first such file: a finished run is recognised without it.
     import h5py
 
-    most_bytes, objects = max(_LARGE_BYTES, _MOST_PACKED * path.stat().st_size), []
+    most_bytes, paths = max(_LARGE_BYTES, _MOST_PACKED * path.stat().st_size), itertools.count(1)
 
     def of_link(name: str, found: Any) -> str | None:
         if name.count("/") > _MOST_NESTED:
             return f"it nests groups more than {_MOST_NESTED} deep"
         return f"{name} is in another file" if isinstance(found, h5py.ExternalLink) else None
 
-    def of_object(name: str, found: Any) -> str | None:
-        objects.append(name)
-        if len(objects) > MOST_OBJECTS:
+    # As a reader walks it, which comes to an object by every path: a link may lead back to a group around it.
+    def of_group(group: Any, name: str) -> str:
+        if name.count("/") > _MOST_NESTED:
+            return f"it nests groups more than {_MOST_NESTED} deep"
+        return next(filter(None, (of_object(found, f"{name}{key}") for key, found in group.items())), "")
+
+    def of_object(found: Any, name: str) -> str:
+        if next(paths) > MOST_OBJECTS:
             return f"it holds more than {MOST_OBJECTS} datasets and groups"
+        if isinstance(found, h5py.Group):
+            return of_group(found, f"{name}/")
         if not isinstance(found, h5py.Dataset):
-            return None
+            return ""
         if found.external or found.is_virtual:
             return f"the values of {name} are in another file"
         return (
-            f"{name} states {found.nbytes / 1e9:.3g} GB, more than the file holds"
-            if found.nbytes > most_bytes
-            else None
+            f"{name} states {found.nbytes / 1e9:.3g} GB, more than the file holds" if found.nbytes > most_bytes else ""
         )
 
     with h5py.File(path) as file:
-        return file.visititems_links(of_link) or file.visititems(of_object) or ""
+        return file.visititems_links(of_link) or of_group(file, "")
