@@ -118,7 +118,7 @@ BAD = [
     ('"5 mm"', '"-5 mm"', ', line 15: plan.cell_size = "-5 mm": this length in mm must be above 0 and at most 100000'),
     ('"5 mm"', '"5 um"', ", line 13: [plan]: cell_size 0.005 mm on a plan of 700 x 180 mm makes 5040000000 cells"),
     ('"22 degC"', '"-300 degC"', ', line 8: thermography.reflected_temperature = "-300 degC": a temperature'),
-    ("0.97", "97", ", line 7: thermography.emissivity = 97: this fraction must be above 0 and at most 1"),
+    ("0.97", "97", ", line 7: thermography.emissivity = 97: this fraction must be above 1e-06 and at most 1"),
     ('"0.7 m", "180 mm"', '"0.7 m"', ", line 14: plan.size needs 2 values"),
     ("[-1, 0]", "[0, 0]", ", line 18: [plan.axis]: the direction [0, 0] "),
     ("[-1, 0]", '["left", 0]', ', line 20: plan.axis.direction = "left": this is a number without quotes'),
