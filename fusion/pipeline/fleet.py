@@ -20,7 +20,7 @@ from fusion.common import CAMPAIGN_FILE, FusionError
 from fusion.pipeline.resume import kept_results
 from fusion.pipeline.workers import start_run
 from fusion.report.fleet import SUMMARY, Row, as_csv, as_json, read_rows, render_fleet, with_findings, write_book
-from fusion.results.folder import MANIFEST, claim, open_folder
+from fusion.results.folder import MANIFEST, claim, open_folder, own_place
 from fusion.results.progress import Report, silent
 from fusion.results.store import write_atomically, write_json, write_text
 from thermography.common import usable_processors
@@ -143,7 +143,9 @@ def run_fleet(
 
     others = psutil.Process().children()
     with open_folder(out, resume=resume):
-        claim(out, SUMMARY, _TABLE, _BOOK, _PAGE)
+        for name in campaigns:
+            own_place(out, name)
+        claim(out, SUMMARY, _TABLE, _BOOK, _PAGE, *map(_log_of, campaigns))
         for name, row in read_rows(out).items() if resume else ():
             # Rows of finished campaigns whose files and products are as an earlier fleet left them.
             if name in campaigns and row.is_whole and is_unchanged(campaigns[name], out / name):
@@ -158,7 +160,7 @@ def run_fleet(
                 while waiting and has_room([*running.values()], jobs, largest or _USUAL_BYTES):
                     name = waiting.pop(0)
                     # Until it ends it is one that was stopped: a signal may come at any time.
-                    rows[name] = replace(rows[name], state="stopped", log=f"{_LOGS}/{name}.log")
+                    rows[name] = replace(rows[name], state="stopped", log=_log_of(name))
                     running[name] = _start(campaigns[name], out, rows[name].log, jobs=jobs, resume=resume)
                 for name, one in list(running.items()):
                     one.measure()
@@ -188,12 +190,19 @@ def has_room(running: Sequence[_Running], jobs: int, largest: float) -> bool:
     return float(psutil.virtual_memory().available) - to_come > largest
 
 
+def _log_of(name: str) -> str:
+    """Return the log of a campaign within the folder of its fleet."""
+    return f"{_LOGS}/{name}.log"
+
+
 def _start(member: Member, out: Path, log: str, *, jobs: int, resume: bool) -> _Running:
     """Start the run of a campaign; everything that it says goes to its log."""
     folder, threads = out / member.name, str(max(usable_processors() // jobs, 1))
     usual = dict.fromkeys(_THREAD_VARIABLES, threads) | {"PYTHONUNBUFFERED": "1"}
     (out / log).parent.mkdir(parents=True, exist_ok=True)
-    with (out / log).open("wb") as stream:
+    # A new file: what has the name may be a pipe, or another name of a file that is no log.
+    (out / log).unlink(missing_ok=True)
+    with (out / log).open("xb") as stream:
         # A session of its own: a Ctrl-C at the terminal is for the fleet, which tells its runs to stop.
         streams = {"stdout": stream, "stderr": stream, "start_new_session": True}
         resumed, options = resume and folder.is_dir(), ("--processes", "1")

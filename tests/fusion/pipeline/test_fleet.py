@@ -58,6 +58,19 @@ def test_a_campaign_does_not_take_a_name_of_the_fleet(tmp_path, name):
         find_members([tmp_path])
 
 
+@pytest.mark.parametrize("name", ["logs", "logs/a.log", "a"])
+def test_a_fleet_writes_through_no_link_that_leads_out(tmp_path, name):
+    touch(tmp_path, "hall/a/campaign.toml", "hall/b/campaign.toml", "others/a.log", "out/fleet.json")
+    out, link = tmp_path / "out", tmp_path / "out" / name
+    (out / "manifest.json").write_text('{"software": "thermofuse", "written": {"fleet.json": "1"}}')
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(tmp_path / "others" / ("a.log" if name.endswith(".log") else ""))
+    with pytest.raises(OutputError, match=rf"'{name}(/a\.log)?' leads out of the results folder; nothing was changed"):
+        run_fleet(find_members([tmp_path / "hall"]), out, resume=True)
+    assert [path.name for path in (tmp_path / "others").iterdir()] == ["a.log"]
+    assert not (out / "fleet.json").read_text() and not (tmp_path / "others/a.log").read_text()
+
+
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory):
     """Two machines measured by the laser alone, in as few cycles as can be evaluated, and one whose readings are not there."""
