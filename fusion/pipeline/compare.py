@@ -30,6 +30,7 @@ from fusion.report.comparison import (
 from fusion.report.page import report_of
 from fusion.report.wording import effect_words, say
 from fusion.results import store
+from fusion.results.folder import claim
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import number
 from fusion.results.parts import read_table_prediction
@@ -114,6 +115,7 @@ def compare_runs(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     """Compare two finished runs and enter the places on which they agree in both reports."""
     pairs = compare_campaigns(folders)
     (pair,), names = pairs, campaign_names(pairs)
+    claim(out, "joint.json", "joint.nc", "joint.html")
     if isinstance(pair.before.results.loop, RecordLoop):
         return _compare_records(pair, out)
     rows, titles = [], [one.results.campaign for one in (pair.before, pair.after)]

@@ -12,7 +12,15 @@ from fusion.pipeline import compare
 from fusion.pipeline.compare import compare_campaigns, compare_runs, require_one_kind
 from fusion.pipeline.run import run_campaign
 from fusion.results.results import read_results
-from fusion.results.store import DamagedProductError, file_sha256, read_dataset, read_tree, write_dataset, write_json
+from fusion.results.store import (
+    DamagedProductError,
+    OutputError,
+    file_sha256,
+    read_dataset,
+    read_tree,
+    write_dataset,
+    write_json,
+)
 from tests.fusion.campaign_parts import change, record_of_rows
 from tests.fusion.compared_tests import readings_of, write_results
 
@@ -71,6 +79,15 @@ def test_two_tests_without_a_camera_are_compared_without_places(tmp_path):
     assert [name for name, _ in rows] == ["changes", "report"]
     assert json.loads((tmp_path / "joint.json").read_text())["agreement"] == []
     assert "As found, as left" in (tmp_path / "joint.html").read_text() and not (tmp_path / "joint.nc").exists()
+
+
+def test_a_page_that_no_run_wrote_is_not_replaced(folders, tmp_path):
+    (tmp_path / "joint.html").write_text("mine")
+    with pytest.raises(
+        OutputError, match=r"joint\.html was not written by thermofuse and is not replaced; move it away"
+    ):
+        compare_runs(folders, tmp_path)
+    assert (tmp_path / "joint.html").read_text() == "mine" and not (tmp_path / "joint.json").exists()
 
 
 @pytest.mark.parametrize("name", ["results.json", "fusion.nc"])
