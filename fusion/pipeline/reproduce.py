@@ -16,7 +16,7 @@ from fusion.pipeline.resume import hash_files, noted_campaign
 from fusion.pipeline.run import run_campaign
 from fusion.results.progress import Report, silent
 from fusion.results.results import ResultsError, in_this_schema
-from fusion.results.store import is_file_list
+from fusion.results.store import is_file_list, read_json
 
 #: Differences that are listed one by one; the others are counted.
 _MOST_LISTED = 12
@@ -79,8 +79,8 @@ def _first(lines: Iterable[str]) -> tuple[str, ...]:
 def _read_json(path: Path) -> Any:
     """Return what a file of a results folder holds."""
     try:
-        return json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
+        return read_json(path)
+    except ValueError as error:
         raise ResultsError(f"{path}: is not JSON ({error}); run the campaign again") from None
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -29,7 +28,7 @@ from fusion.report.wording import ISO230_TERMS, say
 from fusion.results.numbers import fixed, measured, upper_first
 from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
-from fusion.results.store import read_json_object, read_product
+from fusion.results.store import read_json, read_json_object, read_product
 from interferometry.io.tables import DATED
 from thermography.common import spreadsheet_text
 from thermography.large_arrays import in_pieces
@@ -194,7 +193,7 @@ def as_json(rows: Sequence[Row], *, started: str, finished: str) -> dict[str, An
 def read_rows(folder: Path) -> dict[str, Row]:
     """Return the rows of an earlier fleet by name; none where there is no ``fleet.json`` of this layout."""
     try:
-        content = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+        content = read_json(folder / SUMMARY)
         rows = [Row(**{one.name: item[one.name] for one in fields(Row)}) for item in content["campaigns"]]
     except (OSError, ValueError, KeyError, TypeError):
         return {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import os
 import shutil
 import subprocess
@@ -22,7 +21,7 @@ from fusion.report.charts.embedded import Drawn, EmbeddedChart, chart_scripts
 from fusion.report.wording import TEMPLATES, environment
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
-from fusion.results.store import is_file_list, read_fusion, read_product, write_atomically, write_text
+from fusion.results.store import is_file_list, read_fusion, read_json, read_product, write_atomically, write_text
 
 # Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no
 # network.
@@ -129,8 +128,8 @@ def report_of(folder: Path, *, joint: Mapping[str, Any] | None = None) -> str:
     if not origin.is_file():
         raise ProductsError(f"{origin} is missing; {again}")
     try:
-        provenance = json.loads(origin.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
+        provenance = read_json(origin)
+    except ValueError as error:
         raise ProductsError(f"{origin}: not JSON ({error}); {again}") from None
     if not _is_provenance(provenance):
         raise ProductsError(f"{origin}: not the provenance of a run; {again}")

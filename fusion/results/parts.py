@@ -7,7 +7,6 @@ that does not apply is never set, and absent.
 from __future__ import annotations
 
 import ast
-import json
 import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -19,12 +18,13 @@ from typing import Annotated, Literal, TypeGuard
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from fusion.common import FusionError
 from fusion.results.numbers import LEAST_P
+from fusion.results.store import read_json
 
 Number = float | None
 #: A p-value; ``LEAST_P`` stands for any smaller one.
@@ -586,12 +586,12 @@ def read_table_prediction(path: Path) -> TablePrediction:
     """Read the prediction of a table; either file may be named."""
     file = path if path.name.endswith(PREDICTION_ENDING) else path.with_name(path.name + PREDICTION_ENDING)
     try:
-        return TablePrediction.model_validate(json.loads(file.read_text(encoding="utf-8")))
+        return TablePrediction.model_validate(read_json(file))
     except FileNotFoundError:
         raise TablePredictionError(
             f"{file} is missing; name the table that was loaded, as thermofuse export wrote it with its prediction beside it"
         ) from None
-    except (OSError, ValueError, RecursionError, ValidationError) as error:
+    except (OSError, ValueError) as error:
         raise TablePredictionError(
             f"{file}: is damaged or no prediction of a table ({type(error).__name__}); export the table again"
         ) from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +12,7 @@ from pydantic import ValidationError
 
 from fusion.common import Array, FusionError
 from fusion.results.parts import ResultPart
+from fusion.results.store import read_json
 
 #: What a step found: all readings within their range; one held at the end of its range, or a correction at its limit; a failed reading; the
 #: state of the machine is not known (yet); steps come at other times than the model was made for. From `FAILED` on nothing is corrected.
@@ -280,7 +280,7 @@ def run_recursion(
 def read_recursion(path: str | Path) -> Recursion:
     """Read a model description that `export --format model-json` wrote; a RecursionError where the file is none."""
     try:
-        return Recursion.model_validate(json.loads(Path(path).read_text(encoding="utf-8")))
+        return Recursion.model_validate(read_json(Path(path)))
     except (OSError, ValueError, ValidationError) as error:
         told = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise RecursionError(

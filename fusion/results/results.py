@@ -6,7 +6,6 @@ determine it.
 
 from __future__ import annotations
 
-import json
 import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -20,7 +19,7 @@ from fusion.common import FusionError
 from fusion.results import axis, parts
 from fusion.results.loop import AxisLoop, RecordLoop
 from fusion.results.numbers import measured, p_words, print_unit
-from fusion.results.store import Product, plain, require_own
+from fusion.results.store import Product, plain, read_json, require_own
 from thermofuse.resources import vocabulary
 
 if TYPE_CHECKING:
@@ -270,12 +269,12 @@ def read_results(folder: str | Path) -> Results:
     if not path.is_file():
         raise ResultsError(f"{folder}: there is no results.json in it; name the results folder of a finished run")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        content = read_json(path, constant=_refuse_constant)
         results = Results.model_validate(in_this_schema(content))
     except ValidationError as error:
         raise _foreign(path, _first_fault(error)) from None
-    # Also bytes that are no text, numbers of thousands of digits, and brackets without end.
-    except (ValueError, RecursionError) as error:
+    # Also bytes that are no text, and numbers of thousands of digits.
+    except ValueError as error:
         raise _foreign(path, f"not JSON: {error}") from None
     require_own(folder, [path.name])
     return results.of_folder(folder)

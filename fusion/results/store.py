@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _STAMPS = ".stages/stamps.json"
+#: More than any JSON of a run, whose results and provenance with tens of thousands of files have some megabytes, bytes.
+_MOST_JSON_BYTES = 100_000_000
 #: Compressed maps are stored in parts of this size, bytes: one cycle of thousands can be read without the others.
 _CHUNK_BYTES = 1 << 21
 #: How xarray opens a product: many small variables are read nine times as fast as with h5netcdf, with the same content.
@@ -347,11 +349,26 @@ class StageStamps:
             write_json(self._path, self._stamps)
 
 
+def read_json(path: Path, *, constant: Callable[[str], object] | None = None) -> Any:
+    """Return what a JSON file holds, or raise an OSError, or a ValueError that says why not; `constant` is json's `parse_constant`."""
+    # The folder may be a stranger's: neither does a pipe hold the program nor a device fill its memory.
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError("it is a pipe, a socket or a device")
+    with path.open("rb") as file:
+        content = file.read(_MOST_JSON_BYTES + 1)
+    if len(content) > _MOST_JSON_BYTES:
+        raise ValueError(f"it is longer than {_MOST_JSON_BYTES // 1_000_000} MB")
+    try:
+        return json.loads(content.decode(), parse_constant=constant)
+    except RecursionError:
+        raise ValueError("its brackets are nested too deep") from None
+
+
 def read_json_object(path: Path) -> dict[str, Any]:
     """Return what a JSON file holds by name, empty where it is absent, damaged, or holds no such thing."""
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError):
+        return dict(read_json(path))
+    except (OSError, ValueError, TypeError):
         return {}
 
 

@@ -10,7 +10,6 @@ Beckhoff, TF5200 axis compensation, ``kw.ssfk`` with its worked example.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -32,7 +31,7 @@ from fusion.report.wording import environment, say, sentences
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import LATE_KEPT, LATE_STEPS, Recursion, RecursionInput
 from fusion.results.results import Results
-from fusion.results.store import DamagedProductError, file_sha256, group, read_product
+from fusion.results.store import DamagedProductError, file_sha256, group, read_json, read_product
 
 # The error of exports.
 
@@ -578,9 +577,9 @@ def _provenance(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {"parameters": {}}
     try:
-        stated = json.loads(path.read_text(encoding="utf-8"))
+        stated = read_json(path)
         return {**stated, "parameters": dict(stated.get("parameters", {}))}
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise DamagedProductError(
             f"{path}: is damaged or no product of thermofuse ({type(error).__name__}); run the campaign again"
         ) from None

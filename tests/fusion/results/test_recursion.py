@@ -160,6 +160,7 @@ def test_a_description_is_read_as_it_was_written_and_another_file_is_refused(tmp
     model, file = some_model(), tmp_path / "model.json"
     file.write_text(model.model_dump_json(), encoding="utf-8")
     assert read_recursion(file) == model
-    file.write_text('{"format": "thermofuse recursion 1"}', encoding="utf-8")
-    with pytest.raises(RecursionError, match="no model description of thermofuse"):
-        read_recursion(file)
+    for text in ('{"format": "thermofuse recursion 1"}', "[" * 100_000):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(RecursionError, match="no model description of thermofuse"):
+            read_recursion(file)

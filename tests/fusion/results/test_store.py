@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +37,7 @@ from fusion.results.store import (
     plain,
     read_dataset,
     read_fusion,
+    read_json,
     read_json_object,
     read_product,
     read_tree,
@@ -161,14 +163,22 @@ def test_notices_of_finished_stages_are_told_while_a_run_is_under_way(tmp_path: 
     assert noted_messages(tmp_path) == [{"code": "a", "message": "M.", "remedy": "R."}]
 
 
-def test_what_is_no_json_object_holds_nothing(tmp_path: Path) -> None:
+def test_what_is_no_json_object_holds_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "provenance.json"
     assert read_json_object(path) == {}
     for damaged in ("{", "null", "[1, 2]", "[" * 100_000, "\ud800".encode("utf-16", "surrogatepass").decode("latin-1")):
         path.write_text(damaged, encoding="latin-1")
         assert read_json_object(path) == {}
+    path.unlink()
+    os.mkfifo(path)
+    assert read_json_object(path) == {}
+    with pytest.raises(ValueError, match="a pipe, a socket or a device"):
+        read_json(path)
+    path.unlink()
     path.write_text('{"axis": "X"}', encoding="utf-8")
     assert read_json_object(path) == {"axis": "X"}
+    monkeypatch.setattr(store, "_MOST_JSON_BYTES", 10)
+    assert read_json_object(path) == {}
 
 
 def test_large_arrays_are_written_in_pieces_and_stay_in_the_file(
