@@ -588,24 +588,27 @@ def iso230(
     A campaign file adds uncertainties, tolerances and the conditions of the test.
     """
     from fusion.pipeline.iso230 import read_test
-    from fusion.report.sheet import describe_sheet, iso230_csv, iso230_json, iso230_tables, write_iso230
+    from fusion.report import sheet as pages
     from fusion.report.wording import sentences
 
     if as_json and as_csv:
         _refuse("--json and --csv: what is printed has one format; write one of them")
     with _answering():
+        if out is not None:
+            # A long test takes a minute; a name that cannot be written is told before.
+            pages.page_format(out, *pages.SHEET_FORMATS)
         found = read_test(test, cycles)
         if as_json:
-            print_json(iso230_json(found.part, found.dataset))
+            print_json(pages.iso230_json(found.part, found.dataset))
         elif as_csv:
-            sys.stdout.write(iso230_csv(found.dataset))
+            sys.stdout.write(pages.iso230_csv(found.dataset))
         else:
-            for table in iso230_tables(found.part, found.dataset, title=found.title, axis_alone=out is not None):
+            for table in pages.iso230_tables(found.part, found.dataset, title=found.title, axis_alone=out is not None):
                 _wide().print(table)
             _print_lines([*sentences("decided_how", found.part), *found.remarks])
         if out is not None:
-            sheet = describe_sheet(found.title, found.part, files=found.files, own=found.sheet)
-            write_iso230(out, sheet, found.part, found.dataset, remarks=found.remarks)
+            sheet = pages.describe_sheet(found.title, found.part, files=found.files, own=found.sheet)
+            pages.write_iso230(out, sheet, found.part, found.dataset, remarks=found.remarks)
             errors.print(f"page: {out.resolve()}")
 
 

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
     from fusion.analysis.drift_model.verification import ChannelVerdict
 
+#: Endings of the files that a sheet is written to.
+SHEET_FORMATS = (".html", ".pdf", ".docx")
 #: The last condition that says whose test of which axis a sheet is of; the others follow the values.
 _LAST = "sign_convention"
 #: Conditions that stand where somebody signs; who approves stands only there.
@@ -169,7 +171,7 @@ def write_verification(
 
 def _write(path: Path, for_word: Callable[[], Sequence[tuple[Sheet, Axes | None]]], page: Callable[[], str]) -> None:
     """Write sheets, each with its chart, in the format of the file's name; nothing is replaced."""
-    if page_format(path, ".html", ".pdf", ".docx") == ".docx":
+    if page_format(path, *SHEET_FORMATS) == ".docx":
         drawn = for_word()
         write_atomically(path, lambda temporary: _write_word(temporary, drawn))
     else:

@@ -198,7 +198,8 @@ def test_iso230_evaluates_a_window(campaign_folder: Path, tmp_path: Path) -> Non
     assert "Test by ISO 230-2" in out.read_text(encoding="utf-8")
     table = invoke("iso230", campaign_folder / "laser.csv", "--csv").stdout
     assert table.startswith("target,position_mm,mean_positive_um")
-    assert "exists already" in invoke("iso230", campaign_folder / "laser.csv", "--out", out).stderr
+    again = invoke("iso230", campaign_folder / "laser.csv", "--out", out)
+    assert "exists already" in again.stderr and not again.stdout
     refused = invoke("iso230", campaign_folder / "laser.csv", "--cycles", "one")
     assert refused.exit_code == 2 and '--cycles "one": this is not a window of cycles' in refused.stderr
 
