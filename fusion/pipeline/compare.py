@@ -87,7 +87,7 @@ def _axis(folder: Path) -> str:
 
 def _drift(folder: Path) -> xr.Dataset | None:
     """Return the joint estimate of deviations.nc with its positions; of what belongs to single readings the drift alone."""
-    if not (folder / "deviations.nc").is_file() or not store.has(
+    if not store.has_product(folder, "deviations.nc") or not store.has(
         read := store.read_product(folder, "deviations"), "estimate"
     ):
         return None

@@ -28,7 +28,7 @@ from fusion.report.wording import ISO230_TERMS, say
 from fusion.results.numbers import fixed, measured, upper_first
 from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
-from fusion.results.store import read_json, read_json_object, read_product
+from fusion.results.store import has_product, read_json, read_json_object, read_product
 from interferometry.io.tables import DATED
 from thermography.common import spreadsheet_text
 from thermography.large_arrays import in_pieces
@@ -119,7 +119,7 @@ def with_findings(row: Row, folder: Path) -> Row:
     """Return a row with what the results of its run say."""
     try:
         results = read_results(folder)
-        maps = read_product(folder, "fields") if (folder / "fields.nc").is_file() else None
+        maps = read_product(folder, "fields") if has_product(folder, "fields.nc") else None
     except (FusionError, OSError) as error:
         return replace(row, state="failed", message=str(error))
     loop, listed = results.loop, conditions_of(results)

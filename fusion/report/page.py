@@ -21,7 +21,15 @@ from fusion.report.charts.embedded import Drawn, EmbeddedChart, chart_scripts
 from fusion.report.wording import TEMPLATES, environment
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
-from fusion.results.store import is_file_list, read_fusion, read_json, read_product, write_atomically, write_text
+from fusion.results.store import (
+    has_product,
+    is_file_list,
+    read_fusion,
+    read_json,
+    read_product,
+    write_atomically,
+    write_text,
+)
 
 # Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no
 # network.
@@ -135,11 +143,7 @@ def report_of(folder: Path, *, joint: Mapping[str, Any] | None = None) -> str:
         raise ProductsError(f"{origin}: not the provenance of a run; {again}")
     if isinstance(results.loop, RecordLoop):
         return render_report(results, provenance, {"record": read_product(folder, "record")})
-    products = [f"{name}.nc" for name in _DRAWN]
-    missing = [name for name in products if name in provenance.get("products", ()) and not (folder / name).is_file()]
-    if missing:
-        raise ProductsError(f"{folder / missing[0]} is missing; put the file back, or {again}")
-    there = [name for name in _DRAWN if (folder / f"{name}.nc").is_file()]
+    there = [name for name in _DRAWN if has_product(folder, f"{name}.nc")]
     read = {name: read_fusion(folder) if name == "fusion" else read_product(folder, name) for name in there}
     return render_report(results, provenance, read, joint=joint)
 

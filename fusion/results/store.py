@@ -374,15 +374,28 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
 def require_own(folder: Path, names: Iterable[str]) -> None:
     """Refuse products that are not the files which the run of a folder wrote."""
-    written = read_json_object(folder / "provenance.json").get("products")
-    known: dict[str, Any] = written if is_file_list(written) else {}
+    known = _products(folder)
     for name in names:
         path = folder / name
-        if name in known and path.is_file() and file_sha256(path) != known[name]["sha256"]:
+        if has_product(folder, name) and name in known and file_sha256(path) != known[name]["sha256"]:
             raise DamagedProductError(
                 f"{path}: is not the file that this run wrote (its SHA-256 is not that of provenance.json); put that file back, or run the "
                 "campaign again"
             )
+
+
+def has_product(folder: Path, name: str) -> bool:
+    """Return whether a run wrote a product; one that it wrote and that is not there any more is refused."""
+    path = folder / name
+    if not path.is_file() and name in _products(folder):
+        raise DamagedProductError(f"{path} is missing; put the file back, or run the campaign again")
+    return path.is_file()
+
+
+def _products(folder: Path) -> dict[str, Any]:
+    """Return the files that the run of a folder wrote, by name, as its provenance lists them."""
+    written = read_json_object(folder / "provenance.json").get("products")
+    return written if is_file_list(written) else {}
 
 
 def is_file_list(content: object) -> TypeGuard[dict[str, Any]]:

@@ -31,7 +31,7 @@ from fusion.report.wording import environment, say, sentences
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import LATE_KEPT, LATE_STEPS, Recursion, RecursionInput
 from fusion.results.results import Results
-from fusion.results.store import DamagedProductError, file_sha256, group, read_json, read_product
+from fusion.results.store import DamagedProductError, file_sha256, group, has_product, read_json, read_product
 
 # The error of exports.
 
@@ -470,7 +470,7 @@ def read_thermal_state(folder: Path, deviations: xr.Dataset) -> ThermalState:
     """Return the thermal state of a run."""
     times, cycles = deviations["time"].values, deviations["cycle"].values
     timed = times[~np.isnat(times)]
-    there = (folder / "fusion.nc").is_file()
+    there = has_product(folder, "fusion.nc")
     fused: Mapping[Any, xr.DataArray] = read_product(folder, "fusion") if there else {}
     found: dict[str, tuple[float, float, float] | None] = {}
     for name in ("material", "air"):

@@ -31,7 +31,7 @@ from fusion.results.loop import RecordLoop
 from fusion.results.numbers import moment
 from fusion.results.parts import PREDICTION_ENDING, ByDirection, Quantity, TablePrediction
 from fusion.results.results import Results, read_results
-from fusion.results.store import file_sha256, group, has, read_product, write_atomically
+from fusion.results.store import file_sha256, group, has, has_product, read_product, write_atomically
 from interferometry.iso230 import STANDARD_CYCLES
 from thermography.common import write_csv
 from thermography.pictures import write_gif, write_mp4
@@ -198,11 +198,11 @@ def export_results(
     if format in controls.MODELS:
         content, notes = _model_text(folder, found, format, sampling_s=sampling_s, reduced=reduced, force=force)
     elif format in _PICTURES:
-        if not (folder / "fields.nc").is_file():
+        if not has_product(folder, "fields.nc"):
             raise controls.ExportError(f"{folder}: {_NO_PLAN}")
         content = draw_maps(read_product(folder, "fields"), found.hotspots or (), found.campaign, format)
         notes = []
-    elif not (folder / "deviations.nc").is_file():
+    elif not has_product(folder, "deviations.nc"):
         content, notes = _written(_tables_without_laser(folder, found, format), format), []
     elif format in ("csv", "xlsx"):
         deviations = read_product(folder, "deviations")
@@ -325,7 +325,7 @@ def _temperature_text(
     run: _Run, axis: str | None, reference_mm: float | None, *, force: bool
 ) -> tuple[dict[str, str], list[str]]:
     """Return the file of the temperature compensation by name, and what to tell the user."""
-    there = (run.folder / "fusion.nc").is_file()
+    there = has_product(run.folder, "fusion.nc")
     material = read_product(run.folder, "fusion").get("material_temperature") if there else None
     if material is None:
         raise controls.ExportError(
@@ -348,7 +348,7 @@ def _model_text(
 ) -> tuple[dict[str, Writer], list[str]]:
     """Return the file of a record's drift model for a control, and what to tell the user."""
     if not isinstance(results.loop, RecordLoop):
-        if not (folder / "deviations.nc").is_file():
+        if not has_product(folder, "deviations.nc"):
             raise controls.ExportError(f"{folder}: {_NO_LASER}")
         raise controls.ExportError(
             f"{folder}: a drift model is written from a test with temperature sensors ([record]); that of an axis follows a camera, which "
@@ -419,7 +419,7 @@ def _tables_without_laser(folder: Path, results: Results, format: str) -> dict[s
         )
     if record:
         return tables.record_tables(results, read_product(folder, "record"))
-    if (folder / "fields.nc").is_file() and format == "csv":
+    if has_product(folder, "fields.nc") and format == "csv":
         return {"fields": tables.fields_table(folder)}
     if not (frames := tables.camera_tables(results, folder)):
         raise controls.ExportError(
@@ -447,7 +447,7 @@ def _csv_tables(
         "iso230_positions": tables.iso230_position_table(deviations, results),
     }
     if with_fields:
-        if not (folder / "fields.nc").is_file():
+        if not has_product(folder, "fields.nc"):
             raise controls.ExportError(
                 f"{folder}: there is no fields.nc in it, so that no fields.csv can be written; leave --fields out"
             )

@@ -31,7 +31,7 @@ from fusion.results.loop import RecordLoop
 from fusion.results.numbers import print_unit
 from fusion.results.parts import Iso230Condition
 from fusion.results.results import Results
-from fusion.results.store import group, has, opened, read_product, require_kind
+from fusion.results.store import group, has, has_product, opened, read_product, require_kind
 from interferometry.io.tables import DATED
 from thermography.common import ACTING
 
@@ -267,10 +267,10 @@ def record_readings_table(record: xr.Dataset) -> pd.DataFrame:
 def camera_tables(results: Results, folder: Path) -> dict[str, pd.DataFrame]:
     """Return the tables of a camera without a laser by title: of its pictures, and of the plan if it sees one; empty without products."""
     found: dict[str, pd.DataFrame] = {}
-    if (folder / "thermograms.nc").is_file():
+    if has_product(folder, "thermograms.nc"):
         found["Regions"] = _regions_table(results)
         found["Pictures"] = _pictures_table(read_product(folder, "thermograms"))
-    if (folder / "fields.nc").is_file():
+    if has_product(folder, "fields.nc"):
         found["Fields"] = _windows_table(read_product(folder, "fields"))
     return {"Summary": findings_table(results), **found} if found else {}
 

@@ -11,6 +11,7 @@ from playwright.sync_api import sync_playwright
 
 from fusion.report import page as pdf
 from fusion.report.page import ProductsError, report_of
+from fusion.results.store import DamagedProductError
 from tests.browser import CHROMIUM, record_faults
 
 
@@ -146,7 +147,7 @@ def test_it_is_made_anew_from_its_products(made_anew, report, tmp_path):
         report_of(tmp_path)
     whole = json.loads((report.parent / "provenance.json").read_text(encoding="utf-8"))
     (tmp_path / "provenance.json").write_text(json.dumps(whole))
-    with pytest.raises(ProductsError, match=r"\w+\.nc is missing; put the file back, or run the campaign again"):
+    with pytest.raises(DamagedProductError, match=r"\w+\.nc is missing; put the file back, or run the campaign again"):
         report_of(tmp_path)
     damaged = [
         None, [], *({key: value for key, value in whole.items() if key != lost} for lost in ("started", "finished", "command", "inputs")),

@@ -29,6 +29,7 @@ from fusion.results.store import (
     finished_stages,
     group,
     has,
+    has_product,
     in_groups,
     is_large,
     joined,
@@ -334,6 +335,13 @@ def test_a_product_of_another_run_is_told_by_its_hash(tmp_path: Path) -> None:
     write_dataset(path, SENSORS + 1.0)
     with pytest.raises(DamagedProductError, match=r"sensors\.nc: is not the file that this run wrote"):
         read_product(tmp_path, "sensors")
+    path.unlink()
+    for read in (read_product, lambda folder, name: has_product(folder, f"{name}.nc")):
+        with pytest.raises(
+            DamagedProductError, match=r"sensors\.nc is missing; put the file back, or run the campaign"
+        ):
+            read(tmp_path, "sensors")
+    assert not has_product(tmp_path, "absent.nc")
     for damaged in ({}, {"products": {"sensors.nc": {}}}, {"products": 1}):
         write_json(tmp_path / "provenance.json", damaged)
         require_own(tmp_path, ["sensors.nc"])
