@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _STAMPS = ".stages/stamps.json"
 #: More than any JSON of a run, whose results and provenance with tens of thousands of files have some megabytes, bytes.
 _MOST_JSON_BYTES = 100_000_000
+#: Largest number of a JSON file: in any unit far beyond what is measured, and its square is still a number.
+_LARGEST = 1e100
 #: Compressed maps are stored in parts of this size, bytes: one cycle of thousands can be read without the others.
 _CHUNK_BYTES = 1 << 21
 #: How xarray opens a product: many small variables are read nine times as fast as with h5netcdf, with the same content.
@@ -359,9 +361,17 @@ def read_json(path: Path, *, constant: Callable[[str], object] | None = None) ->
     if len(content) > _MOST_JSON_BYTES:
         raise ValueError(f"it is longer than {_MOST_JSON_BYTES // 1_000_000} MB")
     try:
-        return json.loads(content.decode(), parse_constant=constant)
+        return json.loads(content.decode(), parse_constant=constant, parse_float=_measured)
     except RecursionError:
         raise ValueError("its brackets are nested too deep") from None
+
+
+def _measured(text: str) -> float:
+    """A number of a file; beyond any measured one its square overflows, and what is far below is nothing."""
+    value = float(text)
+    if abs(value) > _LARGEST:
+        raise ValueError(f"{text} is no measured number")
+    return value if abs(value) > 1.0 / _LARGEST**3 else 0.0
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

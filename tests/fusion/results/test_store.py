@@ -178,6 +178,11 @@ def test_what_is_no_json_object_holds_nothing(tmp_path: Path, monkeypatch: pytes
     path.unlink()
     path.write_text('{"axis": "X"}', encoding="utf-8")
     assert read_json_object(path) == {"axis": "X"}
+    path.write_text('{"a": [1e308, 0.1]}')
+    with pytest.raises(ValueError, match=r"1e308 is no measured number"):
+        read_json(path)
+    path.write_text('{"a": [5e-324, -1e-9]}')
+    assert read_json_object(path) == {"a": [0.0, -1e-9]}
     monkeypatch.setattr(store, "_MOST_JSON_BYTES", 10)
     assert read_json_object(path) == {}
 
