@@ -145,7 +145,12 @@ def report_of(folder: Path, *, joint: Mapping[str, Any] | None = None) -> str:
         return render_report(results, provenance, {"record": read_product(folder, "record")})
     there = [name for name in _DRAWN if has_product(folder, f"{name}.nc")]
     read = {name: read_fusion(folder) if name == "fusion" else read_product(folder, name) for name in there}
-    return render_report(results, provenance, read, joint=joint)
+    try:
+        return render_report(results, provenance, read, joint=joint)
+    except KeyError as error:
+        raise ProductsError(
+            f"{folder}: the products lack what results.json refers to ({error}), as those of different runs; put the files back, or {again}"
+        ) from error
 
 
 def _is_provenance(content: Any) -> bool:

@@ -282,7 +282,8 @@ def read_results(folder: str | Path) -> Results:
 
 def in_this_schema(content: Any) -> Any:
     """Return the content of a results.json with the keys of this schema."""
-    if isinstance(content, dict) and (content.get("registration") or {}).get("model") == "picture":
+    registration = content.get("registration") if isinstance(content, dict) else None
+    if isinstance(registration, dict) and registration.get("model") == "picture":
         content = {name: part for name, part in content.items() if name not in _OF_A_PICTURE}
     if not isinstance(content, dict) or content.get("schema") not in range(1, SCHEMA_VERSION):
         return content

@@ -402,16 +402,38 @@ def has_product(folder: Path, name: str) -> bool:
     return path.is_file()
 
 
+def read_provenance(folder: Path) -> dict[str, Any]:
+    """Return the provenance of a run, empty where its folder has none; one that cannot be read, and so checks nothing, is refused."""
+    path, again = folder / "provenance.json", "run the campaign again, with --resume to keep what is finished"
+    try:
+        content = read_json(path)
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise DamagedProductError(
+            f"{path}: cannot be read ({error.strerror or error}); allow reading it, or {again}"
+        ) from None
+    except ValueError as error:
+        raise DamagedProductError(f"{path}: not JSON ({error}); {again}") from None
+    tables = content.get("parameters", {}) if isinstance(content, dict) else None
+    if (
+        not isinstance(tables, dict)
+        or not all(isinstance(table, dict) for table in tables.values())
+        or not all(is_file_list(content.get(key, {})) for key in ("inputs", "products"))
+    ):
+        raise DamagedProductError(f"{path}: not the provenance of a run; {again}")
+    return dict(content)
+
+
 def _products(folder: Path) -> dict[str, Any]:
     """Return the files that the run of a folder wrote, by name, as its provenance lists them."""
-    written = read_json_object(folder / "provenance.json").get("products")
-    return written if is_file_list(written) else {}
+    return dict(read_provenance(folder).get("products", {}))
 
 
 def is_file_list(content: object) -> TypeGuard[dict[str, Any]]:
     """Return whether JSON is a list of files as a provenance holds it: by name, with ``bytes`` and ``sha256`` of each."""
     return isinstance(content, dict) and all(
-        isinstance(one, dict) and {"bytes", "sha256"} <= one.keys() for one in content.values()
+        isinstance(one, dict) and "bytes" in one and isinstance(one.get("sha256"), str) for one in content.values()
     )
 
 

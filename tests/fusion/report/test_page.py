@@ -9,6 +9,7 @@ import tempfile
 import pytest
 from playwright.sync_api import sync_playwright
 
+from fusion.common import FusionError
 from fusion.report import page as pdf
 from fusion.report.page import ProductsError, report_of
 from fusion.results.store import DamagedProductError
@@ -155,7 +156,7 @@ def test_it_is_made_anew_from_its_products(made_anew, report, tmp_path):
     ]  # fmt: skip
     for content in damaged:
         (tmp_path / "provenance.json").write_text(json.dumps(content))
-        with pytest.raises(ProductsError, match=r"provenance\.json: not the provenance of a run; run the campaign"):
+        with pytest.raises(FusionError, match=r"provenance\.json: not the provenance of a run; run the campaign"):
             report_of(tmp_path)
 
 

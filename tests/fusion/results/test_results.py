@@ -117,9 +117,13 @@ def test_a_number_that_is_not_determined_is_null_and_a_key_that_does_not_apply_a
 def test_results_that_cannot_be_read_name_file_and_remedy(tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match=r"no results.json in it; name the results folder of a finished run"):
         read_results(tmp_path)
-    (tmp_path / "results.json").write_text('{"schema": 4, "campaign": "A", "warnings": [], "colour": "red"}')
-    with pytest.raises(ResultsError, match=r"results.json: not the results of this version .*; run the campaign again"):
-        read_results(tmp_path)
+    for text in (
+        '{"schema": 4, "campaign": "A", "warnings": [], "colour": "red"}',
+        '{"registration": [1], "schema": 4}',
+    ):
+        (tmp_path / "results.json").write_text(text)
+        with pytest.raises(ResultsError, match=r"json: not the results of this version .*; run the campaign again"):
+            read_results(tmp_path)
 
 
 @pytest.mark.parametrize(("loop", "kind"), [(PARTS["loop"], "axis"), (RECORD_LOOP, "record")])

@@ -347,9 +347,14 @@ def test_a_product_of_another_run_is_told_by_its_hash(tmp_path: Path) -> None:
         ):
             read(tmp_path, "sensors")
     assert not has_product(tmp_path, "absent.nc")
-    for damaged in ({}, {"products": {"sensors.nc": {}}}, {"products": 1}):
+    for damaged in ({"products": {"sensors.nc": {}}}, {"products": 1}, {"parameters": {"campaign": 5}}, []):
         write_json(tmp_path / "provenance.json", damaged)
-        require_own(tmp_path, ["sensors.nc"])
+        with pytest.raises(
+            DamagedProductError, match=r"provenance\.json: not the provenance of a run; run the campaign"
+        ):
+            require_own(tmp_path, ["sensors.nc"])
+    write_json(tmp_path / "provenance.json", {})
+    require_own(tmp_path, ["sensors.nc"])
 
 
 def test_fields_of_another_kind_are_not_left_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
