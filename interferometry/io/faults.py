@@ -86,6 +86,19 @@ def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine],
         )
 
 
+#: More than any test has; a damaged file may give every reading a cycle and a target of its own.
+MOST_CELLS = 5_000_000
+
+
+def raise_if_too_many(path: Path, cycles: int, targets: int) -> None:
+    """Raise where readings by cycle, direction and target would fill the memory."""
+    if 2 * cycles * targets > MOST_CELLS:
+        raise LaserFormatError(
+            f"{path}: {cycles} cycles in 2 directions at {targets} targets are more than {MOST_CELLS:,} readings; give the readings of one "
+            "cycle the same number, and every target its number in all cycles"
+        )
+
+
 # Numbers as instruments and spreadsheets write them: decimal comma or point, thousands, signs, marks for "no
 # reading".
 

@@ -27,7 +27,15 @@ from interferometry.deviations import (
     detect_out_of_order,
     set_flag,
 )
-from interferometry.io.faults import BadReading, LaserFormatError, LeftOut, Numerals, raise_if_mostly_invalid
+from interferometry.io.faults import (
+    MOST_CELLS,
+    BadReading,
+    LaserFormatError,
+    LeftOut,
+    Numerals,
+    raise_if_mostly_invalid,
+    raise_if_too_many,
+)
 from interferometry.io.renishaw import (
     START_BYTES,
     is_ecmc_log,
@@ -129,7 +137,7 @@ def check_and_assemble(given: Readings) -> xr.Dataset:
         _check_cycles(path, readings)
         given.notes += _note_of_minutes(readings)
         time = {"origin": "recorded", "reference": describe_time_zone(path, given.zones)}
-    deviations = _assemble(readings)
+    deviations = _assemble(path, readings)
     deviations = _flag_cells(deviations, UNREADABLE, given.unreadable)
     deviations = _flag_cells(deviations, DUPLICATE, duplicates)
     if given.zones:
@@ -316,10 +324,11 @@ def _check_cycles(path: Path, readings: list[Reading]) -> None:
             )
 
 
-def _assemble(readings: Sequence[Reading]) -> xr.Dataset:
+def _assemble(path: Path, readings: Sequence[Reading]) -> xr.Dataset:
     cycles = sorted({reading.cycle for reading in readings})
     position = {reading.target: reading.position for reading in readings}
     targets = sorted(position)
+    raise_if_too_many(path, len(cycles), len(targets))
     row = {cycle: i for i, cycle in enumerate(cycles)}
     column = {target: i for i, target in enumerate(targets)}
     deviation = np.full((len(cycles), 2, len(targets)), np.nan)
@@ -769,8 +778,6 @@ _FEWEST_TARGETS = 2
 _NEAR = 0.02
 #: Words beside the number of a run: axis, "number" and the sign of ISO 230-2.
 _BESIDE_NUMBERS = ("no", "nr", "j", "x", "y", "z", "u", "w", "c")
-#: More than any table of positions by run has; rows are given the width of the widest one, which must not fill the memory.
-_MOST_CELLS = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -847,7 +854,8 @@ def join_tables(tables: Sequence[WideTable]) -> WideTable:
 def _find_block(grid: Grid) -> WideTable | None:
     """Return the table of position by run in a grid with one title."""
     width = max(len(fields) for _, fields in grid.rows)
-    if width * len(grid.rows) > _MOST_CELLS:
+    # Rows are given the width of the widest one, which must not fill the memory.
+    if width * len(grid.rows) > MOST_CELLS:
         return None
     cells = [[*fields, *[""] * (width - len(fields))] for _, fields in grid.rows]
     heads = (at for at, row in enumerate(cells) if any(text and not PLAIN_VALUE.fullmatch(text) for text in row))

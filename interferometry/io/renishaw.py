@@ -13,7 +13,14 @@ import numpy as np
 import xarray as xr
 
 from interferometry.deviations import DIRECTIONS, build_deviations
-from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError, LeftOut, parse_number
+from interferometry.io.faults import (
+    SENTINEL_MAGNITUDE,
+    BadReading,
+    LaserFormatError,
+    LeftOut,
+    parse_number,
+    raise_if_too_many,
+)
 from interferometry.io.tables import NO_ZONE, decode_text, encoding_of, read_heading
 
 #: Bytes by which the file of a laser program is told.
@@ -102,6 +109,7 @@ def _assemble_ecmc(path: Path, entries: Iterable[_Entry]) -> xr.Dataset:
     if unit not in _UM_PER_UNIT:
         raise LaserFormatError(f"{path}: UNIT={unit} is not known; use one of {', '.join(_UM_PER_UNIT)}")
     cycles, targets = _counts(path, stated, target_at, readings)
+    raise_if_too_many(path, cycles, targets)
     scale = _UM_PER_UNIT[unit]
     position = np.array([target_at[target] for target in range(1, targets + 1)])
     deviation = np.full((cycles, 2, targets), np.nan)
@@ -186,7 +194,7 @@ def read_rtl(path: Path, feed_mm_per_min: float | None = None, dwell_s: float | 
     notes = _clear_filled_runs(runs, unidirectional=flags[1:2] == ["1"])
     start, end, start_u = _parse_test_times(sections)
     schedule, schedule_u = _rebuild_schedule(runs, targets, start, end, feed_mm_per_min, dwell_s)
-    deviation, seconds = _lay_out(runs, targets, schedule)
+    deviation, seconds = _lay_out(path, runs, targets, schedule)
     time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
     if start is not None:
         taken = np.isfinite(seconds)
@@ -211,10 +219,13 @@ def read_rtl(path: Path, feed_mm_per_min: float | None = None, dwell_s: float | 
     return dataset
 
 
-def _lay_out(runs: list[_Run], targets: np.ndarray, schedule: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _lay_out(
+    path: Path, runs: list[_Run], targets: np.ndarray, schedule: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return deviations in um and seconds since the start, (cycle, direction, target), from the runs in measuring order."""
     directions = [_direction(run, targets) for run in runs]
     cycles = [directions[: i + 1].count(direction) for i, direction in enumerate(directions)]
+    raise_if_too_many(path, max(cycles, default=1), len(targets))
     deviation = np.full((max(cycles, default=1), 2, len(targets)), np.nan)
     seconds = np.full(deviation.shape, np.nan)
     for run, direction, cycle, instants in zip(runs, directions, cycles, schedule, strict=True):

@@ -739,6 +739,18 @@ def test_one_wide_line_above_many_short_ones_does_not_fill_the_memory(tmp_path):
     tracemalloc.stop()
 
 
+def test_a_cycle_and_a_target_for_every_reading_do_not_fill_the_memory(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(
+        "cycle,target,position (mm),direction,deviation (um)\n"
+        + "".join(f"{i},{i},{i},+,0.1\n" for i in range(1, 1_601))
+    )
+    with pytest.raises(
+        LaserFormatError, match=r"1600 cycles in 2 directions at 1600 targets are more than 5,000,000 readings; give"
+    ):
+        read_deviations(path)
+
+
 def test_a_title_and_headings_in_two_units_are_refused(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("Deviations in um\nPosition [mm];1+ [mm];1- [mm]\n0;0.001;0.002\n100;0.003;0.004\n")
