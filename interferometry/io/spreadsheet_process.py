@@ -12,6 +12,14 @@ from typing import Any
 import python_calamine
 
 Cell = bool | int | float | str
+#: More than any workbook of readings has; what has more takes long to be found none.
+MOST_SHEETS, MOST_COLUMNS = 1_000, 2_000
+#: As many as spreadsheet programs write.
+MOST_ROWS, MOST_CHARACTERS = 1_048_576, 32_767
+
+
+class BeyondLimits(Exception):
+    """A workbook has more than readings need."""
 
 
 def limit_resources(memory: int, seconds: int) -> None:
@@ -29,11 +37,16 @@ def read_cells(path: str, as_stored: bool) -> dict[str, list[tuple[int, list[Cel
     sheets = {}
     with Path(path).open("rb") as file:
         workbook = python_calamine.CalamineWorkbook.from_filelike(file)
+    if len(workbook.sheets_metadata) > MOST_SHEETS:
+        raise BeyondLimits
     for each in workbook.sheets_metadata:
         if each.typ != python_calamine.SheetTypeEnum.WorkSheet:
             continue
         if as_stored or each.visible == python_calamine.SheetVisibleEnum.Visible:
             sheet = workbook.get_sheet_by_name(each.name)
+            bottom, right = sheet.end or (0, 0)
+            if bottom >= MOST_ROWS or right >= MOST_COLUMNS:
+                raise BeyondLimits
             rows = [
                 (number, [_marshallable(value) for value in row])
                 for number, row in enumerate(sheet.to_python(skip_empty_area=False), start=1)
@@ -63,14 +76,17 @@ def _marshallable(value: object) -> Cell:
         # An elapsed time counts its hours beyond a day.
         clock = str(datetime.datetime(1900, 1, 1) + value % datetime.timedelta(days=1))[11:]
         return f"{24 * value.days + int(clock[:2]):02d}{clock[2:]}"
-    return str(value).strip()
+    text = str(value).strip()
+    if len(text) > MOST_CHARACTERS:
+        raise BeyondLimits
+    return text
 
 
 if __name__ == "__main__":
     limit_resources(int(sys.argv[3]), int(sys.argv[4]))
     try:
         answer: Any = read_cells(sys.argv[1], sys.argv[2] == "True")
-    except MemoryError:
+    except (MemoryError, BeyondLimits):
         sys.exit(1)
     # The reader is compiled: on damaged files it raises errors of several kinds, a panic among them, which is no Exception.
     except BaseException as fault:

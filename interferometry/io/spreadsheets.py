@@ -13,7 +13,7 @@ from pathlib import Path
 
 from interferometry.io import spreadsheet_process
 from interferometry.io.faults import LaserFormatError
-from interferometry.io.spreadsheet_process import Cell
+from interferometry.io.spreadsheet_process import MOST_CHARACTERS, MOST_COLUMNS, MOST_ROWS, MOST_SHEETS, Cell
 
 #: Beginning of a ZIP archive, which .xlsx and .ods are, and of a compound file, which .xls is.
 _MAGIC = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
@@ -46,8 +46,9 @@ def read_cells(path: Path, *, as_stored: bool = False) -> dict[str, list[tuple[i
         process = None
     if process is None or process.returncode:
         raise LaserFormatError(
-            f"{path}: cannot be read as a spreadsheet within {MOST_BYTES / 1e9:g} GB and {MOST_SECONDS} s; delete the rows and columns "
-            "beyond the table, not only what is in them, and save the sheet with the measured values alone as XLSX"
+            f"{path}: cannot be read as a spreadsheet within {MOST_BYTES / 1e9:g} GB and {MOST_SECONDS} s, {MOST_SHEETS:,} sheets, "
+            f"{MOST_ROWS:,} rows, {MOST_COLUMNS:,} columns and {MOST_CHARACTERS:,} characters in a cell; delete rows and columns beyond "
+            "the table, not only what is in them, and save the sheet with the measured values alone as XLSX"
         )
     answer = marshal.loads(process.stdout)
     if isinstance(answer, str):

@@ -29,6 +29,7 @@ from interferometry.io.faults import (
     RejectedLine,
     raise_if_mostly_invalid,
 )
+from interferometry.io.spreadsheet_process import MOST_COLUMNS, MOST_ROWS
 from interferometry.io.spreadsheets import is_workbook, read_sheets
 from thermofuse.resources import vocabulary
 from thermofuse.units import SHARE, Unit, find_unit
@@ -425,11 +426,9 @@ def _in_a_code_page(content: bytes) -> str:
 
 #: Marks that may stand between fields.
 DELIMITERS = ";\t,|"
-#: More columns than any table of readings or log of channels has; what has more takes long to be found none.
-MOST_COLUMNS = 2_000
 #: A line with a reading has more characters; a text with more shorter lines than a spreadsheet has rows is damaged, and takes long to
 #: be found so.
-_SHORT_LINE, _MOST_SHORT_LINES = 4, 1_048_576
+_SHORT_LINE = 4
 #: Longest part of a line of the file that a message repeats, characters.
 _SHOWN = 160
 
@@ -484,8 +483,8 @@ def read_grids(path: Path, *, sheet: str | None = None) -> list[Grid]:
         return [Grid(path, name, rows, name) for name, rows in sheets.items() if sheet in (None, name)]
     text = decode_text(path, content)
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    short = sum(len(line) < _SHORT_LINE for line in lines) if len(lines) > _MOST_SHORT_LINES else 0
-    if short > _MOST_SHORT_LINES:
+    short = sum(len(line) < _SHORT_LINE for line in lines) if len(lines) > MOST_ROWS else 0
+    if short > MOST_ROWS:
         raise LaserFormatError(
             f"{path}: {short} lines with nothing or fewer than {_SHORT_LINE} characters, too short for a reading; the file is damaged or "
             "no table, export it again"

@@ -180,9 +180,34 @@ def chain_without_an_end(path: Path) -> None:
     path.write_bytes(content)
 
 
+def many_cells_in_a_row(path: Path) -> None:
+    write_ods(path, REPEATED.format(1, 2_001, 1))
+
+
+def many_rows(path: Path) -> None:
+    write_xlsx(path, rows="<row><c><v>1</v></c></row>" * 1_048_576)
+
+
+def long_text(path: Path) -> None:
+    write_ods(path, [["x" * 32_768]])
+
+
+def many_sheets(path: Path) -> None:
+    more = "".join(f'<table:table table:name="{number}"></table:table>' for number in range(1_000))
+    replace_part(
+        write_ods(path, []),
+        "content.xml",
+        lambda xml: xml.replace("</office:spreadsheet>", f"{more}</office:spreadsheet>"),
+    )
+
+
 @pytest.mark.parametrize(
     "hostile",
     [
+        many_cells_in_a_row,
+        many_rows,
+        long_text,
+        many_sheets,
         far_xlsx,
         number_beyond_any_row,
         packed_zeros,
