@@ -25,8 +25,8 @@ from fusion.results.store import (
     has_product,
     is_file_list,
     read_fusion,
-    read_json,
     read_product,
+    read_provenance,
     write_atomically,
     write_text,
 )
@@ -131,16 +131,10 @@ def render_report(
 def report_of(folder: Path, *, joint: Mapping[str, Any] | None = None) -> str:
     """Return the report of a finished run, made again from its products; `joint` as in `render_report`."""
     results = read_results(folder)
-    origin = folder / "provenance.json"
-    again = "run the campaign again, with --resume to keep what is finished"
-    if not origin.is_file():
-        raise ProductsError(f"{origin} is missing; {again}")
-    try:
-        provenance = read_json(origin)
-    except ValueError as error:
-        raise ProductsError(f"{origin}: not JSON ({error}); {again}") from None
+    provenance, again = read_provenance(folder), "run the campaign again, with --resume to keep what is finished"
     if not _is_provenance(provenance):
-        raise ProductsError(f"{origin}: not the provenance of a run; {again}")
+        fault = ": not the provenance of a run" if provenance else " is missing"
+        raise ProductsError(f"{folder / 'provenance.json'}{fault}; {again}")
     if isinstance(results.loop, RecordLoop):
         return render_report(results, provenance, {"record": read_product(folder, "record")})
     there = [name for name in _DRAWN if has_product(folder, f"{name}.nc")]

@@ -31,7 +31,13 @@ from fusion.report.wording import environment, say, sentences
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import LATE_KEPT, LATE_STEPS, Recursion, RecursionInput
 from fusion.results.results import Results
-from fusion.results.store import DamagedProductError, file_sha256, group, has_product, read_json, read_product
+from fusion.results.store import (
+    file_sha256,
+    group,
+    has_product,
+    read_product,
+    read_provenance,
+)
 
 # The error of exports.
 
@@ -511,8 +517,8 @@ class Origin:
 
 def read_origin(folder: Path, results: Results, state: ThermalState) -> Origin:
     """Return where a table comes from."""
-    provenance = _provenance(folder / "provenance.json")
-    stated = {name: table for name, table in provenance["parameters"].items() if isinstance(table, dict)}
+    provenance = read_provenance(folder)
+    stated = provenance.get("parameters", {})
     report = stated.get("report", {})
     serial = report.get("machine_serial_number")
     return Origin(
@@ -570,19 +576,6 @@ def header_lines(origin: Origin, **facts: Any) -> list[str]:
     made = environment(html=False).overlay(finalize=lambda value: one_line(value) if isinstance(value, str) else value)
     text = made.get_template("compensation_header.j2").render(origin=origin, **{"exported": datetime.now(UTC), **facts})
     return [one_line(line) for line in text.splitlines() if line]
-
-
-def _provenance(path: Path) -> dict[str, Any]:
-    """Return the provenance of a run; without a campaign where the file is absent."""
-    if not path.is_file():
-        return {"parameters": {}}
-    try:
-        stated = read_json(path)
-        return {**stated, "parameters": dict(stated.get("parameters", {}))}
-    except (ValueError, TypeError, AttributeError) as error:
-        raise DamagedProductError(
-            f"{path}: is damaged or no product of thermofuse ({type(error).__name__}); run the campaign again"
-        ) from None
 
 
 def one_line(text: str) -> str:
