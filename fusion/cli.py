@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
 import sys
@@ -912,6 +913,8 @@ def main() -> None:
     needed = "xarray" in sys.modules or "--scheduler" in " ".join(sys.argv)
     if not needed and not _PLUGINS & metadata.entry_points().groups:
         sys.modules.setdefault("dask", None)  # type: ignore[arg-type]
+    # What is wrong with a file is said once, in the words of the command.
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     try:
         app(prog_name="thermofuse")
     except SystemExit as ended:

@@ -1,10 +1,12 @@
-"""A signal that comes while the libraries are loaded ends the command as one that comes later."""
+"""The command as a process: a signal while its libraries are loaded ends it as a later one; their logs are not shown."""
 
 from __future__ import annotations
 
 import signal
+import struct
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -39,3 +41,14 @@ def test_the_command_runs() -> None:
     command = [sys.executable, "-m", "thermofuse", "--version"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0 and ended.stdout.startswith("thermofuse ")
+
+
+def test_the_log_of_a_library_is_not_shown(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    # The one tag of its page is a width of as many numbers as there are, beyond the end of the file.
+    path.write_bytes(struct.pack("<2s3HHHHIII", b"II", 42, 8, 0, 1, 256, 4, 2**32 - 1, 100, 0))
+    ended = subprocess.run(
+        [sys.executable, "-m", "thermofuse", "inspect", str(path)], capture_output=True, text=True, check=False
+    )
+    assert "tifffile" not in ended.stdout + ended.stderr
+    assert "colours are not temperatures" in ended.stdout + ended.stderr
