@@ -343,7 +343,9 @@ def _jpeg_segments(file: BinaryIO, path: Path, front: bytes) -> Segments:
             f"{path}: at 0x{offset:X}: expected FLIR APP1 segments, found none: the JPEG is not radiometric (export it from the camera)"
         )
     if missing:
-        raise FlirFormatError(f"{path}: at 0x{offset:X}: expected FLIR segments 0 to {last}, found no {missing}")
+        raise FlirFormatError(
+            f"{path}: at 0x{offset:X}: expected FLIR segments 0 to {last}, {len(missing)} are missing, the first is {missing[0]}"
+        )
     return tuple(pieces[index] for index in range(last + 1))
 
 
