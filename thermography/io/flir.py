@@ -344,7 +344,8 @@ def _jpeg_segments(file: BinaryIO, path: Path, front: bytes) -> Segments:
         )
     if missing:
         raise FlirFormatError(
-            f"{path}: at 0x{offset:X}: expected FLIR segments 0 to {last}, {len(missing)} are missing, the first is {missing[0]}"
+            f"{path}: at 0x{offset:X}: expected FLIR segments 0 to {last}, found {last + 1 - len(missing)} of them; the first missing one "
+            f"is {missing[0]}"
         )
     return tuple(pieces[index] for index in range(last + 1))
 

@@ -136,7 +136,9 @@ def test_segments_must_be_complete_and_single(tmp_path):
     segments = _segments(data)
     offset, length = segments[2]
     path.write_bytes(data[:offset] + data[offset + length :])
-    with pytest.raises(FlirFormatError, match=r"expected FLIR segments 0 to 2, 1 are missing, the first is 1$"):
+    with pytest.raises(
+        FlirFormatError, match=r"expected FLIR segments 0 to 2, found 2 of them; the first missing one is 1$"
+    ):
         read_frame(path)
     path.write_bytes(data[: offset + length] + data[offset:])
     with pytest.raises(FlirFormatError, match="expected FLIR segment 1 once, found it twice"):
