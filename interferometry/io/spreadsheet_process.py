@@ -18,10 +18,6 @@ MOST_SHEETS, MOST_COLUMNS = 1_000, 2_000
 MOST_ROWS, MOST_CHARACTERS = 1_048_576, 32_767
 
 
-class BeyondLimits(Exception):
-    """A workbook has more than readings need."""
-
-
 def limit_resources(memory: int, seconds: int) -> None:
     """Limit memory (bytes) and processor time of this process where the platform can; a reader that is ended leaves no core dump."""
     with suppress(ImportError, ValueError, OSError):
@@ -38,7 +34,7 @@ def read_cells(path: str, as_stored: bool) -> dict[str, list[tuple[int, list[Cel
     with Path(path).open("rb") as file:
         workbook = python_calamine.CalamineWorkbook.from_filelike(file)
     if len(workbook.sheets_metadata) > MOST_SHEETS:
-        raise BeyondLimits
+        raise MemoryError("more sheets than readings need")
     for each in workbook.sheets_metadata:
         if each.typ != python_calamine.SheetTypeEnum.WorkSheet:
             continue
@@ -46,7 +42,7 @@ def read_cells(path: str, as_stored: bool) -> dict[str, list[tuple[int, list[Cel
             sheet = workbook.get_sheet_by_name(each.name)
             bottom, right = sheet.end or (0, 0)
             if bottom >= MOST_ROWS or right >= MOST_COLUMNS:
-                raise BeyondLimits
+                raise MemoryError("more rows or columns than readings need")
             rows = [
                 (number, [_marshallable(value) for value in row])
                 for number, row in enumerate(sheet.to_python(skip_empty_area=False), start=1)
@@ -78,7 +74,7 @@ def _marshallable(value: object) -> Cell:
         return f"{24 * value.days + int(clock[:2]):02d}{clock[2:]}"
     text = str(value).strip()
     if len(text) > MOST_CHARACTERS:
-        raise BeyondLimits
+        raise MemoryError("more letters in a cell than spreadsheet programs write")
     return text
 
 
@@ -86,7 +82,7 @@ if __name__ == "__main__":
     limit_resources(int(sys.argv[3]), int(sys.argv[4]))
     try:
         answer: Any = read_cells(sys.argv[1], sys.argv[2] == "True")
-    except (MemoryError, BeyondLimits):
+    except MemoryError:
         sys.exit(1)
     # The reader is compiled: on damaged files it raises errors of several kinds, a panic among them, which is no Exception.
     except BaseException as fault:

@@ -61,10 +61,10 @@ def test_results_that_cannot_be_opened_or_were_edited_are_listed_as_such(tmp_pat
     screen._list()
     assert [label for label in screen._labels if "(cannot be read)" in label] == ["later (cannot be read)"]
 
-    def locked(path, **options):
+    def locked(path, *how, **options):
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "read_text", locked)
+    monkeypatch.setattr(Path, "open", locked)
     screen._list()
     assert list(screen._labels) == ["before (cannot be read)", "later (cannot be read)"]
 
