@@ -139,10 +139,11 @@ def test_a_chart_that_cannot_be_drawn_costs_no_result(new_run):
 def test_a_stage_of_the_second_process_counts_the_time_of_its_work_and_not_of_the_wait(new_run):
     run = new_run()
     begun = run.begin("deviations", Counting(0.3))
-    time.sleep(0.6)
+    time.sleep(1.0)
+    asked = time.perf_counter()
     begun()
-    # Writing takes some hundredths of a second; the pause between beginning and asking is no part of the stage.
-    assert 0.3 <= run.seconds["deviations"] < 0.6
+    # The pause between beginning and asking is no part of the stage, what follows is; half a second is for a busy machine.
+    assert 0.3 <= run.seconds["deviations"] < 0.8 + time.perf_counter() - asked
 
 
 def test_a_long_recording_keeps_the_cycles_of_its_own_input_alone(new_run):
