@@ -255,12 +255,11 @@ def _not_used(content: FolderContent, lines: Sequence[str]) -> Iterator[str]:
         yield from ("", _NOT_USED)
         offered = "; [drivers] above names it in comments"
         for one in (*left, *content.unknown):
-            name, words = (
-                content.relative(one.path),
-                _plain(one.reason) or f"{one.kind.value.words}{one.kind.value.unused}",
-            )
+            name = content.relative(one.path)
             if one.temperatures is not None:
                 words = f"temperatures without a displacement{offered if f'# file = {_quoted(name)}' in lines else ''}"
+            else:
+                words = _plain(one.reason) or f"{one.kind.value.words}{one.kind.value.unused}"
             yield f"#   {_plain(name)}: {words}"
 
 
@@ -502,21 +501,10 @@ def _drivers(content: FolderContent) -> Iterator[str]:
     if content.of(Kind.DRIVERS):
         yield from ("", "[drivers]")
         yield from _optional("file", content, Kind.DRIVERS)
-    elif logs := [
-        (one.temperatures, _quoted(content.relative(one.path)))
-        for one in (*content.of(Kind.RECORD), *content.unknown)
-        if one.temperatures is not None and "long" not in one.temperatures.keys
-    ]:
-        table, name = logs[0]
-        yield from (
-            "",
-            "# [drivers]                              # temperatures that the drift may follow: remove each # to use them",
-        )
-        yield f"# file = {name}"
-        yield from (f"# {key} = {_toml(value)}" for key, value in table.keys.items())
-        yield "# [drivers.columns]"
-        used = (one for one in table.columns if one.role in ROLES[1:-1])
-        yield from (f"# {_quoted(one.heading)} = {_toml({'role': one.role, 'unit': one.unit})}" for one in used)
+    else:
+        # Drivers have no line for every change.
+        logs = ((one.temperatures, content.relative(one.path)) for one in (*content.of(Kind.RECORD), *content.unknown))
+        yield from next((_offered(table, name) for table, name in logs if table and "long" not in table.keys), ())
     if content.frames and content.of(Kind.DEVIATIONS):
         yield from ("", "[model]", 'declared = ["axis_expansion", "table_offset"]')
 
@@ -543,6 +531,19 @@ def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker)
             unit = column.unit or "1"
             example = _toml({"role": role_of_unit(unit), "unit": unit})
             yield f"# {_quoted(_plain(column.heading))} = {example}{remark}"
+
+
+def _offered(table: TableProposal, name: str) -> Iterator[str]:
+    """Yield a log of temperatures as drivers, in comments."""
+    yield from (
+        "",
+        "# [drivers]                              # temperatures that the drift may follow: remove each # to use them",
+    )
+    yield f"# file = {_quoted(name)}"
+    yield from (f"# {key} = {_toml(value)}" for key, value in table.keys.items())
+    yield "# [drivers.columns]"
+    used = (one for one in table.columns if one.role in ROLES[1:-1])
+    yield from (f"# {_quoted(one.heading)} = {_toml({'role': one.role, 'unit': one.unit})}" for one in used)
 
 
 def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:

@@ -466,16 +466,13 @@ def _course(times: NDArray[np.datetime64], reference: str, noun: str) -> Iterato
     if timed.size == 0:
         return
     length = duration(float((timed[-1] - timed[0]) / np.timedelta64(1, "s")))
-    zone = "" if reference == NO_ZONE else None
+    zone, dated = "" if reference == NO_ZONE else None, timed[0] >= DATED
 
     def at(time: np.datetime64) -> str:
-        dated = timed[0] >= DATED
         return moment(time, zone) if dated else f"{time.astype('M8[ns]').astype(np.int64) / 1e9:.10g} s"
 
-    if timed[0] < DATED:
-        yield f"{at(timed[0])} to {at(timed[-1])} after a start that is not stated, {length}"
-    else:
-        yield f"{at(timed[0])} to {at(timed[-1])}, {length}, {reference}"
+    ends = f"{at(timed[0])} to {at(timed[-1])}"
+    yield f"{ends}, {length}, {reference}" if dated else f"{ends} after a start that is not stated, {length}"
     if timed.size > 1:
         gaps = [
             f"{at(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
